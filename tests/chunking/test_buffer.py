@@ -1,5 +1,5 @@
-"""Chunks that overlap, and what is done next; the age of observations, whatever the wall clock
-does.
+"""Overlapping chunks and the next executed row, and the age of observations, independent of the
+wall clock.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def chunk(number: int, step: int, values: list[float], *, done: bool = False) ->
 
 
 def values(plan: ChunkBuffer, steps: int) -> list[float | None]:
-    """What is done at so many steps from now on; the plan advances by them."""
+    """Return the executed values of the next `steps` steps, and advance the plan by these steps."""
     done: list[float | None] = []
     for _ in range(steps):
         done.append(None if plan.next is None else round(float(plan.next.action[0]), 6))
@@ -46,8 +46,8 @@ def test_while_the_robot_holds_no_row_is_left_out_however_long_that_takes() -> N
     plan.add(chunk(0, 0, [0, 1, 2]))
     assert values(plan, 2) == [0, 1]
     for _ in range(1000):
-        assert plan.next is not None  # and nobody advances it
-    assert plan.add(chunk(1, 1, [10, 20, 30]))  # of an observation before the second row
+        assert plan.next is not None  # the plan is not advanced
+    assert plan.add(chunk(1, 1, [10, 20, 30]))  # from an observation before the second row
     assert values(plan, 3) == [20, 30, None]
 
 
@@ -121,7 +121,8 @@ def test_a_policy_that_chunks_in_real_time_is_told_of_no_more_rows_than_are_left
     plan = ChunkBuffer()
     assert plan.continuation(3) == {}
     plan.add(chunk(0, 0, [0, 1, 2]))
-    for delay, told in ((0, 0), (2, 2), (150, 3)):  # of a stall, the whole rest will be executed
+    # after a stall, all remaining rows will be executed
+    for delay, told in ((0, 0), (2, 2), (150, 3)):
         assert plan.continuation(delay)["delay_ticks"] == told
 
 
@@ -129,12 +130,12 @@ def test_a_policy_that_chunks_in_real_time_is_told_of_no_more_rows_than_are_left
     ("delays", "expected"),
     [
         ([], 0),
-        ([150], 150),  # a cold start is all that is known
+        ([150], 150),  # the cold start is the only known delay
         ([150, 3], 3),
-        ([150, 140, 3], 3),  # two compiled
-        ([150, 140, 3, 90, 2], 3),  # a stall
+        ([150, 140, 3], 3),  # two calls included compilation
+        ([150, 140, 3, 90, 2], 3),  # one stall
         ([3, 3, *[2] * 5, *[6] * 5], 6),  # a slower network
-        ([3, 3, *[6] * 10, *[2] * 9], 2),  # and a faster one
+        ([3, 3, *[6] * 10, *[2] * 9], 2),  # a faster network
     ],
 )
 def test_the_expected_delay_leaves_out_a_cold_start_and_a_stall(
@@ -166,14 +167,14 @@ def test_rows_are_handed_out_one_by_one_and_replaced_at_once() -> None:
     assert plan.executed == 4
     with pytest.raises(PolicyFailed, match="no row is left for step 4"):
         plan.take()
-    # Two of its rows would have been executed before.
+    # Its first two rows belong to steps that have already been executed.
     plan.replace(np.array([[6.0], [7.0], [8.0]], np.float32), step=2)
     assert plan.take().row == 2
     assert plan.next is None
 
 
 class Clocks(SimulatedTime):
-    """Those of the machine, and the age of what was captured at a time of its wall clock."""
+    """The machine's clocks, and the age of an observation captured at a given wall time."""
 
     def __init__(self) -> None:
         self.now, self.wall_s = 100.0, 1.8e9

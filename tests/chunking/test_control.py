@@ -1,5 +1,5 @@
-"""Interventions: who moves the robot at a tick, what the policy learns of it, and how it begins
-again.
+"""Interventions: who controls the robot at each tick, the information that the policy gets, and its
+restart.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from vlagents_ray.interface import DELAY, EXECUTED, INTERVENTION, LEFTOVER, SAFE
 from vlagents_ray.robot import Guard
 
 HORIZON = 5
-ROW = 0.01  # between two rows of a chunk
+ROW = 0.01  # distance between two rows of a chunk
 
 
 class Near(Agent):
-    """Continues from where the robot stands, in small steps, as a policy with absolute targets
-    does.
+    """A policy that continues from the robot's position in small steps, like a policy with absolute
+    targets.
     """
 
     contract = Contract(action=ActionSpec(dim=2, delta=False, low=-5.0, high=5.0))
@@ -53,7 +53,7 @@ class Near(Agent):
 
 
 class Arm:
-    """Stands where the last action commanded it."""
+    """An arm that reaches the last commanded position at once."""
 
     def __init__(self, player: ChunkPlayer) -> None:
         self.player = player
@@ -69,7 +69,7 @@ class Arm:
         return act
 
     def settle(self) -> None:
-        """Wait until the policy has answered what it was asked."""
+        """Wait until the policy has answered its current request."""
         wait_for(lambda: self.player._caller is None or not self.player._caller.busy, every_s=0.001)
 
 
@@ -78,7 +78,7 @@ def row(value: float) -> np.ndarray:
 
 
 def ahead(obs: Obs) -> np.ndarray:
-    """A human who moves on by 0.05 a tick."""
+    """Return the action of a human who moves by 0.05 per tick."""
     return np.asarray(obs.state["joints"] + np.float32(0.05), np.float32)
 
 
@@ -145,9 +145,9 @@ def test_each_frame_of_a_correction_has_what_the_policy_wanted(
         known += WANTED in act.info and act.info[WANTED].shape == (2,)
     assert len(leader.given) == 20
     assert known >= (16 if options == MODES[1] else 20), (
-        "at the tick of a request in open loop, nobody waits for it"
+        "in open loop, the policy's action is unknown at the tick of a request"
     )
-    assert max(agent.at) > 0.5, "the policy is asked with what a human has made of the scene"
+    assert max(agent.at) > 0.5, "the policy is called with the scene as the human changed it"
 
 
 @pytest.mark.parametrize("options", MODES)
@@ -173,7 +173,7 @@ def test_after_the_release_only_answers_to_new_observations_are_executed(
         arm.settle()
     assert first is not None
     assert first.action[0] - released[0] <= (first.info["row"] + 1) * ROW + 1e-6, (
-        "a plan of before would lie elsewhere"
+        "an earlier plan would be at another position"
     )
     assert max(steps) <= 0.08 + 1e-6
     assert all(LEFTOVER not in info for info in agent.asked[asked : asked + 1])
@@ -194,7 +194,7 @@ def test_an_answer_in_progress_at_the_release_is_dropped(make: Any) -> None:
     assert "released" in held.info[SAFE]
     agent.gate.release()
     arm.settle()
-    assert SAFE in arm.tick().info  # the answer that came is of an observation of before
+    assert SAFE in arm.tick().info  # the answer belongs to an observation from before
     wait_for(lambda: len(agent.asked) == 3)
     agent.gate.release()
     arm.settle()
@@ -261,13 +261,13 @@ def test_the_policy_is_told_what_was_executed_in_its_place(make: Any) -> None:
     assert agent.asked[1][EXECUTED].tolist() == given
     for _ in range(4):
         arm.tick()
-    assert EXECUTED not in agent.asked[2], "it is said once"
+    assert EXECUTED not in agent.asked[2], "the outcome is reported once"
     leader.held = True
     arm.tick()
     leader.held = False
     arm.player.reset(arm.seen(), "again")
     arm.tick()
-    assert EXECUTED not in agent.asked[-1], "in another episode"
+    assert EXECUTED not in agent.asked[-1], "the command belongs to another episode"
 
 
 def test_a_served_policy_is_told_with_its_next_request(players: list[ChunkPlayer]) -> None:
@@ -330,7 +330,7 @@ def test_real_time_chunking_never_states_a_plan_that_nobody_executes(make: Any) 
         arm.settle()
     rest = next(info[LEFTOVER] for info in agent.asked[asked:] if LEFTOVER in info)
     assert rest[0, 0] == pytest.approx(float(arm.pose[0]), abs=5 * ROW), (
-        "the plan from after the release"
+        "the plan from an observation after the release"
     )
 
 
@@ -350,7 +350,7 @@ def test_errors_of_the_policy_take_no_robot_from_a_human(
         act = arm.tick()
         arm.settle()
         assert SAFE not in act.info
-    assert WANTED not in act.info, "it is not known"
+    assert WANTED not in act.info, "the policy's action is unknown"
     assert act.info["silent_s"] == 0.0
 
 
@@ -359,7 +359,7 @@ def test_nobody_waits_for_the_policy_while_a_human_moves_the_robot(make: Any) ->
     arm, leader = make(agent, deadline_s=60.0)
     leader.held = True
     for _ in range(HORIZON + 3):
-        arm.tick()  # would wait a minute for the answer that never comes
+        arm.tick()  # without the intervention, this would wait a minute for the answer
     assert len(leader.given) == HORIZON + 3
 
 
@@ -375,7 +375,7 @@ def test_a_pause_holds_the_robot_until_it_is_over(make: Any) -> None:
         assert act.info[SAFE] == "paused by an operator"
         assert act.action == pytest.approx(at)
     assert arm.player.control.state == "paused"
-    assert len(agent.asked) > asked + 7, "its answers may bring the command to go on"
+    assert len(agent.asked) > asked + 7, "its answers may contain the command to continue"
     assert len(arm.player._plan._chunks) <= 1
     arm.player.control.resume()
     asked = len(agent.asked)
@@ -433,7 +433,7 @@ def test_a_human_takes_over_from_a_pause_and_gives_back_to_the_policy(make: Any)
     leader.held = True
     arm.tick()
     control.pause("look first")
-    assert SAFE not in arm.tick().info, "it begins at the release"
+    assert SAFE not in arm.tick().info, "the request begins at the release"
     leader.held = False
     assert arm.tick().info[SAFE] == "look first"
 
@@ -483,7 +483,7 @@ def lines_of(function: Any) -> list[int]:
     return sorted({line for _, _, line in function.__code__.co_lines() if line is not None})
 
 
-# From the second line on: a pause of before the tick is one that a human takes over from.
+# From the second line, since a human may take over from a pause that began before the tick.
 @pytest.mark.parametrize("line", range(2, len(lines_of(RobotControl.update))))
 @pytest.mark.parametrize("command", ["pause", "stop"])
 def test_a_command_between_any_two_lines_of_a_tick_is_not_lost(line: int, command: str) -> None:
@@ -500,7 +500,7 @@ def test_a_command_between_any_two_lines_of_a_tick_is_not_lost(line: int, comman
                 threading.Thread(target=getattr(control, command), args=("by the operator",))
             )
             threads[0].start()
-            # Longer if the state is locked; then it is the next one that counts.
+            # If the state is locked, the command takes longer and applies to the next tick.
             threads[0].join(0.01)
         return trace
 

@@ -1,4 +1,4 @@
-"""The safe action follows from what a policy's actions mean."""
+"""The safe action is derived from the meaning of a policy's actions."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_the_last_actions_gripper_is_held_and_an_own_action_taken_as_it_is() -> 
             == home.tolist()
         )
     SafeAction("hold", ActionSpec())(Obs(), LAST)[:] = 9
-    assert LAST[0] == np.float32(0.3), "the last action itself is not handed out"
+    assert LAST[0] == np.float32(0.3), "the safe action must be a copy of the last action"
 
 
 def test_what_is_made_from_the_last_action_wants_one() -> None:

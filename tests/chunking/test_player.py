@@ -1,4 +1,4 @@
-"""The chunk player around policies whose answers come when the test lets them."""
+"""The chunk player with policies whose answers a test releases."""
 
 from __future__ import annotations
 
@@ -34,14 +34,16 @@ HORIZON = 6
 
 
 class Counting(Agent):
-    """Answers the observation of tick t with the rows t, t + 0.1, t + 0.2, ..., when it is let."""
+    """A policy that answers the observation of tick t with the rows t, t + 0.1, t + 0.2, ..., when
+    the test permits it.
+    """
 
     shared = ("seen",)
 
     def __init__(
         self, *, gated: bool = False, rows: int = HORIZON, done_at: int | None = None
     ) -> None:
-        self.seen: list[dict[str, Any]] = []  # info of the observations that it was asked about
+        self.seen: list[dict[str, Any]] = []  # info of its observations
         self.failure: Exception | None = None
         self.rows = rows
         self.done_at = done_at
@@ -52,7 +54,7 @@ class Counting(Agent):
 
     def act(self, obs: Obs) -> Act:
         self.seen.append(obs.info)
-        if self.gated and len(self.seen) > 1:  # the first is what `reset` waits for
+        if self.gated and len(self.seen) > 1:  # `reset` waits for the first answer
             assert self.gate.acquire(timeout=30)
         if self.failure is not None:
             raise self.failure
@@ -87,7 +89,7 @@ def playing() -> Iterator[Callable[..., tuple[Counting, ChunkPlayer]]]:
 
 
 def let(agent: Counting, player: ChunkPlayer) -> None:
-    """One answer, and wait until the player could take it."""
+    """Permit one answer, and wait until the player can use it."""
     agent.gate.release()
     wait_for(lambda: player._caller is not None and not player._caller.busy, every_s=0.001)
 
@@ -100,7 +102,7 @@ Playing = Callable[..., tuple[Counting, ChunkPlayer]]
     [
         (3, {}, [0, 0.1, 0.2, 3, 3.1, 3.2, 6], [0, 3, 6]),  # whole chunks
         (3, {"execute": 2}, [0, 0.1, 2, 2.1, 4], [0, 2, 4]),
-        # Within the deadline an answer is waited for.
+        # The player waits for an answer until the deadline.
         (1, {"deadline_s": 30.0}, [0, 1, 2, 3], [0, 1, 2, 3]),
         (
             6,
@@ -120,12 +122,13 @@ def test_a_chunk_is_executed_as_far_as_the_mode_says(
 
 def test_async_executes_the_old_chunk_while_the_next_is_made(playing: Playing) -> None:
     agent, player = playing(Counting(gated=True), mode="async")
-    assert play(player, range(3)) == [0, 0.1, 0.2]  # asked at tick 1, no answer yet
+    # the request was sent at tick 1, and has no answer yet
+    assert play(player, range(3)) == [0, 0.1, 0.2]
     let(agent, player)
-    # Rows 2 and 3 of the answer to tick 1: its first two are late.
+    # Rows 2 and 3 of the answer to tick 1, whose first two rows are late.
     assert play(player, range(3, 5)) == [1.2, 1.3]
     wait_for(lambda: len(agent.seen) == 3)
-    # One request at a time, and then the newest observation.
+    # Only one request runs at a time; the next one has the newest observation.
     assert [info["t"] for info in agent.seen] == [0, 1, 3]
 
 
@@ -136,8 +139,8 @@ def test_a_policy_of_single_actions_has_one_for_each_tick(playing: Playing) -> N
         act = player.act(obs(t))
         assert "safe" not in act.info
         done.append(round(float(act.action[0]), 4))
-        let(agent, player)  # within the tick
-    assert done == [0, 0, 1, 2, 3, 4, 5, 6]  # each a tick late
+        let(agent, player)  # the answer arrives within the tick
+    assert done == [0, 0, 1, 2, 3, 4, 5, 6]  # each action is one tick late
 
 
 def test_a_policy_of_single_actions_that_takes_three_ticks_has_one_for_each_third(
@@ -170,7 +173,7 @@ def test_async_executes_no_row_beyond_the_horizon_or_for_which_others_were_execu
     agent, player = playing(Counting(gated=True), mode="async")
     agent.rows = 2
     play(player, range(HORIZON))
-    let(agent, player)  # to tick 1: rows for ticks 1 and 2
+    let(agent, player)  # the answer to tick 1, with rows for ticks 1 and 2
     assert "so late" in player.act(obs(HORIZON)).info["safe"]
 
 
@@ -179,17 +182,17 @@ def test_without_an_action_in_time_the_safe_one_is_given_and_says_so(playing: Pl
     play(player, range(HORIZON))
     begun = time.monotonic()
     act = player.act(obs(HORIZON))
-    assert time.monotonic() - begun < 25  # and the policy's answer never comes
+    assert time.monotonic() - begun < 25  # the policy's answer never arrives
     assert act.action.tolist() == pytest.approx([0.5, 0.5])
     assert "waiting" in act.info["safe"]
     assert act.info["silent_s"] > 0
     let(agent, player)
-    # The answer to tick 1, of whose rows five had others executed in their place.
+    # The answer to tick 1, of whose rows five were replaced by safe actions.
     late = player.act(obs(HORIZON + 1))
     assert (late.info["row"], late.info["age_ticks"]) == (5, HORIZON)
     assert "safe" not in late.info
     assert "safe" in player.act(obs(HORIZON + 2)).info
-    let(agent, player)  # to the tick after
+    let(agent, player)  # the answer to the tick after
     assert player.act(obs(HORIZON + 3)).action[0] == pytest.approx(HORIZON + 1 + 0.1)
 
 
@@ -241,9 +244,9 @@ def test_rows_of_an_observation_from_before_the_loop_hung_are_not_executed(
     assert play(player, range(2)) == [0, 0.1]
     clock.now = 1.0
     assert "older than max_age_s" in player.act(obs(2)).info["safe"]
-    let(agent, player)  # the answer to tick 1, as old
+    let(agent, player)  # the answer to tick 1, which is equally old
     assert "older than max_age_s" in player.act(obs(3)).info["safe"]
-    let(agent, player)  # to tick 3, from after it went on
+    let(agent, player)  # the answer to tick 3, after the player had continued
     assert play(player, range(4, 5)) == [3.0]
 
 
@@ -281,25 +284,26 @@ def test_a_plan_grows_old_from_when_its_observation_was_captured(playing: Playin
         now = time.monotonic()
         patch.setattr("vlagents_ray.chunking.player.time.monotonic", lambda: now + 1.0)
         patch.setattr("vlagents_ray.chunking.buffer.time.monotonic", lambda: now + 1.0)
-        assert play(player, range(8, 9)) == [8]  # asked again, though five rows were left
+        # a new request was sent although five rows were left
+        assert play(player, range(8, 9)) == [8]
 
 
 def test_after_an_interrupt_nothing_is_executed_that_was_planned_or_asked_before(
     playing: Playing,
 ) -> None:
     agent, player = playing(Counting(gated=True), mode="async")
-    assert play(player, range(3)) == [0, 0.1, 0.2]  # asked at tick 1
+    assert play(player, range(3)) == [0, 0.1, 0.2]  # requested at tick 1
     player.interrupt()
     let(agent, player)  # the answer to tick 1
     act = player.act(obs(3))
     assert "was stopped" in act.info["safe"]
-    assert act.action[0] == pytest.approx(0.1)  # 0.2 was not executed
-    let(agent, player)  # to tick 3
+    assert act.action[0] == pytest.approx(0.1)  # the row 0.2 was not executed
+    let(agent, player)  # the answer to tick 3
     assert play(player, range(4, 6)) == [3, 3.1]
 
 
 class Pose:
-    """Where the robot stands."""
+    """The robot's measured position."""
 
     def __init__(self, at: float) -> None:
         self.at = at
@@ -315,9 +319,9 @@ def test_the_first_action_is_compared_with_the_measured_pose(playing: Playing) -
     )
     act = player.act(obs(0))
     assert "expected a step of at most max_step" in act.info["safe"]
-    assert act.action.tolist() == [5, 5]  # where it stands
+    assert act.action.tolist() == [5, 5]  # the robot's position
     pose.at = 1.0
-    assert "safe" in player.act(obs(1)).info  # nothing is planned any more
+    assert "safe" in player.act(obs(1)).info  # the plan is empty
     let(agent, player)
     assert play(player, range(2, 4)) == [1, 1.1]
 
@@ -333,7 +337,8 @@ def test_after_an_interrupt_the_measured_pose_counts_and_not_what_was_commanded_
     let(agent, player)
     player.interrupt()
     pose.at = 3.1  # moved by hand
-    assert player.act(obs(3)).action.tolist() == pytest.approx([3.1, 3.1])  # stays there
+    # the robot holds this position
+    assert player.act(obs(3)).action.tolist() == pytest.approx([3.1, 3.1])
     let(agent, player)
     assert play(player, range(4, 6)) == [3, 3.1]
 
@@ -348,9 +353,10 @@ def test_after_an_interrupt_nothing_leads_back_to_what_was_commanded_before_it(
     assert play(player, range(3)) == [0, 0.1, 0.2]
     player.interrupt()
     pose.at = 0.9
-    assert player.act(obs(3)).action.tolist() == pytest.approx([0.9, 0.9])  # as home is rejected
+    # the home position is rejected
+    assert player.act(obs(3)).action.tolist() == pytest.approx([0.9, 0.9])
     player.interrupt()
-    pose.at = 5.0  # beyond the limits, so that no action is right
+    pose.at = 5.0  # beyond the limits, so that no action is accepted
     with pytest.raises(InvalidAction, match="above the limit 1"):
         player.act(obs(4))
     agent.gate.release(100)
@@ -366,10 +372,10 @@ def test_after_safe_actions_one_may_begin_at_the_measured_pose_or_at_the_last_ac
     play(player, range(HORIZON))
     pose.at = 9.0
     assert "safe" in player.act(obs(6)).info
-    let(agent, player)  # to tick 1: its last row is 1.5
+    let(agent, player)  # the answer to tick 1, whose last row is 1.5
     assert "safe" in player.act(obs(7)).info
-    let(agent, player)  # to tick 7
-    assert "safe" in player.act(obs(8)).info  # 7.0 is at neither
+    let(agent, player)  # the answer to tick 7
+    assert "safe" in player.act(obs(8)).info  # 7.0 is at neither position
     pose.at = 8.0
     let(agent, player)
     assert play(player, range(9, 11)) == [8, 8.1]
@@ -408,7 +414,7 @@ def test_a_broken_answer_is_not_executed(playing: Playing) -> None:
     agent.rows = 0
     let(agent, player)
     act = player.act(obs(2))
-    assert act.action[0] == pytest.approx(0.2)  # of the chunk before
+    assert act.action[0] == pytest.approx(0.2)  # from the previous chunk
     assert act.info["chunk"] == 0
 
 
@@ -429,8 +435,8 @@ def test_an_action_that_the_guard_refuses_is_replaced_by_the_safe_one_or_by_the_
 @pytest.mark.parametrize(
     ("guard", "options", "passed"),
     [
-        (Guard(high=0.15), {}, 2),  # which has no safe action in open loop without a deadline
-        (Guard(low=5.0), {"mode": "async"}, 0),  # before the first one there is none to hold
+        (Guard(high=0.15), {}, 2),  # this mode has no safe action in open loop without a deadline
+        (Guard(low=5.0), {"mode": "async"}, 0),  # before the first action there is none to hold
     ],
 )
 def test_without_a_safe_action_what_the_guard_refuses_is_raised(
@@ -483,7 +489,7 @@ def test_a_safe_action_that_does_not_fit_is_refused_before_the_robot_moves(
 def test_a_reset_forgets_what_was_planned_and_what_is_under_way(playing: Playing) -> None:
     agent, player = playing(Counting(gated=True), mode="async")
     play(player, range(3))
-    agent.gate.release(2)  # the request of tick 1, and the one of the reset
+    agent.gate.release(2)  # the request of tick 1 and the one of the reset
     player.reset(obs(50), "unstack")
     act = player.act(obs(50))
     assert act.action[0] == 50
@@ -562,12 +568,14 @@ def test_a_reply_that_was_lost_replays_nothing() -> None:
     player.close()
     served.close()
     assert resumed
-    # Each of its own tick.
+    # Each value belongs to its own tick.
     assert all(value == pytest.approx(t - age + 0.1 * age) for t, value, age in done)
 
 
 class Continuing(Agent):
-    """Real-time chunking in small: new chunks begin with the frozen rows and go on by 0.1 a row."""
+    """A policy with simplified real-time chunking: new chunks begin with the frozen rows and
+    continue by 0.1 per row.
+    """
 
     contract = Contract(action=ActionSpec(dim=1, delta=False))
 
@@ -587,7 +595,7 @@ def test_real_time_chunking_over_the_wire_joins_chunks_without_a_jump(real_time:
     caller = player._caller
     assert caller is not None
     for tick in range(60):
-        if tick % 10 == 9:  # no answer takes longer, however busy the machine is
+        if tick % 10 == 9:  # give the policy time to answer, however busy the machine is
             wait_for(lambda: not caller.busy, every_s=0.001)
         act = player.act(Obs())
         assert "safe" not in act.info
@@ -601,8 +609,8 @@ def test_real_time_chunking_over_the_wire_joins_chunks_without_a_jump(real_time:
 
 
 class Given(Counting):
-    """Trained with prefixes: its chunks begin with at most two rows of the plan, and go on
-    faster each time.
+    """A policy that was trained with prefixes: its chunks begin with at most two rows of the plan,
+    and continue faster each time.
     """
 
     def act(self, obs: Obs) -> Act:
@@ -622,7 +630,7 @@ def test_an_answer_later_than_the_rows_it_was_given_is_dropped_and_the_plan_goes
 ) -> None:
     agent, player = playing(Given(gated=True, rows=10), mode="async", real_time_chunking=True)
     actions, chunks = [], []
-    for t, ticks in ((0, 2), (2, 4), (6, 1), (7, 1)):  # each answer comes after so many ticks
+    for t, ticks in ((0, 2), (2, 4), (6, 1), (7, 1)):  # number of ticks until each answer arrives
         for tick in range(t, t + ticks):
             act = player.act(obs(tick))
             actions.append(round(float(act.action[0]), 4))
@@ -630,7 +638,7 @@ def test_an_answer_later_than_the_rows_it_was_given_is_dropped_and_the_plan_goes
             assert "safe" not in act.info
         let(agent, player)
     assert chunks == [0, 0, 1, 1, 1, 1, 1, 3], (
-        "the third answer came after four rows, of which it was given one"
+        "the third answer arrived after four rows, but its chunk begins with only one of them"
     )
     assert actions == pytest.approx([0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.4])
 
@@ -655,7 +663,7 @@ def test_a_player_is_driven_again_while_its_last_request_is_under_way(playing: P
     wait_for(lambda: len(agent.seen) == 2)
     opener = threading.Timer(0.2, agent.gate.release)
     opener.start()
-    player.initialize()  # as the next run of a loop does
+    player.initialize()  # like the next run of a loop
     opener.join()
     assert isinstance(agent, Connected)
     assert not agent.overlapped

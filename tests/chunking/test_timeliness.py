@@ -1,4 +1,4 @@
-"""Which ticks count as in time, and what a player tells its server of them."""
+"""The ticks that count as in time, and the reports of a player to its server about them."""
 
 from __future__ import annotations
 
@@ -29,17 +29,19 @@ from vlagents_ray.slo import Slo
 
 
 class Answers(Agent):
-    """Answers with `rows` rows when it is let; the first request, that of a reset, at once."""
+    """A policy that answers with `rows` rows when the test permits it. The first request, which
+    belongs to a reset, is answered at once.
+    """
 
     contract = Contract(action=ActionSpec(dim=1, delta=True))
 
     def __init__(self, rows: int) -> None:
         self.rows = rows
-        self.infos: list[dict[str, Any]] = []  # infos of the observations of its requests
+        self.infos: list[dict[str, Any]] = []  # infos of the observations in its requests
         self.answer_info: dict[str, Any] = {}
         self.failure: Exception | None = None
         self.options: dict[str, Any] = {}
-        self.let = 1  # requests that it answers
+        self.let = 1  # number of requests that it answers
         self.answered = 0
         self.reads_slo = True
 
@@ -57,7 +59,7 @@ class Answers(Agent):
 
 
 class Driver:
-    """A robot whose operator counts what moves it."""
+    """A robot whose operator counts the actions that move it."""
 
     def __init__(self, rows: int, **options: Any) -> None:
         self.agent = Answers(rows)
@@ -67,7 +69,7 @@ class Driver:
         self._waits_after_stop = False
 
     def tick(self) -> Act:
-        """Act, and count the tick by what the robot executed."""
+        """Act, and count the tick according to the executed action."""
         act = self.player.act(Obs())
         if self.player.control.state != "autonomous":
             self._waits_after_stop = True
@@ -81,7 +83,9 @@ class Driver:
         return act
 
     def answer(self) -> None:
-        """Let the policy answer the request in progress, and wait until the player can take it."""
+        """Permit the policy's answer to the current request, and wait until the player can
+        use it.
+        """
         caller = self.player._caller
         assert caller is not None
         if not caller.busy:
@@ -95,14 +99,12 @@ class Driver:
         wait_for(lambda: not caller.busy, every_s=0.0005)
 
     def request(self, number: int) -> dict[str, Any]:
-        """Return the info of a request, the first of which is that of the reset, once it is
-        there.
-        """
+        """Return the info of a request as soon as it has been sent. Request 0 is the reset's."""
         wait_for(lambda: len(self.agent.infos) > number, every_s=0.0005)
         return self.agent.infos[number]
 
     def stop(self) -> None:
-        """Stop the robot and let it go on."""
+        """Stop the robot, and let it continue."""
         self.player.interrupt()
         self._waits_after_stop = True
 
@@ -162,7 +164,7 @@ def test_a_row_that_the_guard_refuses_was_in_time_and_the_wait_after_it_does_not
     assert SAFE in act.info
     assert player.timeliness.time_share.share == 1.0
 
-    # The policy has not answered to an observation from after the refusal.
+    # The policy has not yet answered to an observation made after the rejection.
     for _ in range(3):
         act = player.act(Obs())
         assert SAFE in act.info
@@ -179,17 +181,18 @@ def test_a_request_reports_the_ticks_since_the_last_one_and_the_slack() -> None:
     of_the_reset = driver.request(0)
     assert (of_the_reset[SLACK], of_the_reset[TICKS]) == (0.0, [0, 0])
     first = driver.request(1)
-    assert first[TICKS] == [1, 0]  # asked at the second tick, after the first
+    assert first[TICKS] == [1, 0]  # requested at the second tick, after the first was counted
     assert first[EXECUTED_AGE] >= 0
 
-    driver.player._tick_begins.extend(float(tick) for tick in range(20))  # of 1 Hz
+    # begin times of ticks at 1 Hz
+    driver.player._tick_begins.extend(float(tick) for tick in range(20))
     for _ in range(4):
         driver.tick()
     driver.answer()
     driver.tick()
     last = driver.request(2)
     ticks, starved = last[TICKS]
-    assert (ticks, starved) == (5, 2)  # the rows of the first answer ended
+    assert (ticks, starved) == (5, 2)  # the rows of the first answer have ended
     driver.close()
 
 
@@ -232,7 +235,7 @@ def test_the_slack_is_the_time_of_the_rows_that_are_left(rows_left: int, slack_m
 def test_a_player_asks_no_sooner_than_the_server_wants_but_never_starves_for_it() -> None:
     driver = Driver(10)
     driver.player._period_ms = lambda: 1000.0  # type: ignore[method-assign]
-    # A batch takes two ticks, and the way a half.
+    # A batch takes two ticks, and the network half a tick.
     driver.agent.answer_info = {REPLAN: 1e6, "timing": {"inference_ms": 2000.0, "wire_ms": 500.0}}
     driver.agent.let = 10**9
     for _ in range(3):
@@ -246,14 +249,17 @@ def test_a_player_asks_no_sooner_than_the_server_wants_but_never_starves_for_it(
         driver.answer()
         played += 1
         assert played < 10
-    # It asked with three rows behind that of its tick: slack for the batch and half a tick.
+    # The request was sent with three rows left after the current one: slack for the batch and half
+    # a tick.
     assert driver.player._plan.known == 3
     assert driver.player.timeliness.starved == 0
     driver.close()
 
 
 def test_the_answer_at_the_reset_sets_the_pace_too() -> None:
-    """Otherwise a fleet that begins at once asks twice at once."""
+    """Otherwise all robots of a fleet that begins at once would send their second requests
+    at once.
+    """
     agent = Answers(10)
     agent.answer_info = {REPLAN: 1e6, "timing": {"inference_ms": 0.0, "wire_ms": 0.0}}
     agent.let = 10**9

@@ -1,4 +1,4 @@
-"""Each command that reads a file of settings finds it by its name, and changes it by the same
+"""Each command that reads a settings file finds it by name, and changes its settings with the same
 options.
 """
 
@@ -53,7 +53,7 @@ FLEET = {
 
 
 class Captured(Exception):
-    """The settings with which a command would go on."""
+    """Raised with the settings with which a command would continue."""
 
     def __init__(self, settings: dict[str, Any]) -> None:
         super().__init__()
@@ -62,11 +62,11 @@ class Captured(Exception):
 
 @dataclass(frozen=True)
 class Row:
-    """A command that reads a file."""
+    """A command that reads a settings file."""
 
-    words: list[str]  # {file} is the file
+    words: list[str]  # arguments; {file} is the file
     document: dict[str, Any]  # the content of the file
-    prefix: str = ""  # prefix of `SETTINGS` in what --set changes
+    prefix: str = ""  # prefix of `SETTINGS` in the arguments of --set
     command: typer.Typer = app
 
 
@@ -95,7 +95,9 @@ ROWS = {
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working directory in which commands end where they would use the settings."""
+    """Return a working directory in which commands end at the point where they would use the
+    settings.
+    """
 
     def of_deployment(_: Any, config: dict[str, Any], **__: Any) -> None:
         raise Captured(config)
@@ -135,14 +137,14 @@ def ended(row: Row, *options: str, file: str = "conf/nightly.yaml") -> Any:
 
 
 def captured(row: Row, *options: str, file: str = "conf/nightly.yaml") -> dict[str, Any]:
-    """Return the settings with which a command would go on."""
+    """Return the settings with which a command would continue."""
     done = ended(row, *options, file=file)
     assert isinstance(done.exception, Captured), done.output
     return done.exception.settings
 
 
 def changes(row: Row, *texts: str) -> list[str]:
-    """Return the options for changes of the settings; a sign comes before the prefix."""
+    """Return the options that change the settings. A sign comes before the prefix."""
     options = []
     for text in texts:
         sign = text[0] if text[0] in "+~" else ""
@@ -289,7 +291,7 @@ def test_each_command_that_reads_a_file_is_in_the_table() -> None:
         reads_file = any("(.yaml)" in text or "deployment file" in text.lower() for text in helps)
         if reads_file:
             with_files.add(name)
-    # `slurm` passes the options of `eval` and `serve` on.
+    # `slurm` passes on the options of `eval` and `serve`.
     names = {name.removesuffix(" --policy") for name in ROWS if "/" not in name}
     assert with_options == {name for name in names if not name.startswith("slurm")}
     assert with_files == with_options

@@ -1,4 +1,4 @@
-"""Nothing that a command says is cut off, wrapped where it is copied from, or taken for markup."""
+"""No output of a command is truncated, wrapped where users copy it, or interpreted as markup."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CURE = (
 
 @pytest.fixture(params=[True, False], ids=["terminal", "pipe"])
 def shown(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
-    """What is printed, at a terminal of 80 columns or into a pipe."""
+    """Return the printed text, at a terminal of 80 columns or through a pipe."""
     text = io.StringIO()
     colours = {"color_system": None, "_environ": {"COLUMNS": "80", "TERM": "xterm"}}
     one = PlainConsole(file=text, force_terminal=request.param, **colours)
@@ -191,7 +191,7 @@ def test_no_command_prints_on_a_console_or_in_a_table_of_its_own() -> None:
             assert not re.search(r"\bConsole\(|Console\(stderr|\[bold\]|\[/\]|from_markup", text), (
                 file.name
             )
-            # evaluation/run.py, doctor.py, which fold.
+            # evaluation/run.py and doctor.py use tables, which must fold.
             for made in re.findall(r"\bTable\((.*)\)", text):
                 assert 'overflow="fold"' in text, (file.name, made)
 
@@ -199,7 +199,7 @@ def test_no_command_prints_on_a_console_or_in_a_table_of_its_own() -> None:
 def test_a_command_loads_neither_ray_nor_torch_unasked_and_ends_without_looking_for_garbage_once_more() -> (
     None
 ):
-    """In all of Ray, for half a second."""
+    """A garbage collection at the exit would scan all of Ray, which takes half a second."""
     code = (
         "import atexit, gc, sys; from vlagents_ray.cli import main; sys.argv = ['vlagents-ray', "
         "'--help']; "
@@ -216,7 +216,8 @@ def test_all_commands_are_on_one_screen() -> None:
     said = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80", "TERMINAL_WIDTH": "80"}).output
     names = re.findall(r"^  ([a-z][\w-]*)  ", said, re.MULTILINE)
     assert names[:5] == ["serve", "eval", "robot", "demo", "doctor"]
-    assert len(said.splitlines()) <= len(names) + 18  # no text of a command needs a second line
+    # the help text of each command fits on one line
+    assert len(said.splitlines()) <= len(names) + 18
 
 
 HOSTILE = (

@@ -1,4 +1,4 @@
-"""What `vlagents-ray doctor` finds on a machine, and the cures that it names."""
+"""The results of `vlagents-ray doctor` on a machine, and the cures that it names."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_every_check_gives_a_row_of_its_own_and_none_breaks() -> None:
         assert names.count(expected) == 1
     assert [row for row in rows if "the check itself broke" in row.detail] == []
     assert [row for row in rows if row.status != "ok" and not row.cure] == []
-    # What the check's program says of this Python.
+    # The program of the check examines this Python.
     assert dict(named_rows)["torch"].detail.startswith(importlib.metadata.version("torch"))
 
 
@@ -213,7 +213,7 @@ class TestAPolicysPython:
         monkeypatch.setattr(doctor, "driver_version", lambda: "570.1")
 
     def interpreter(self, folder: str, says: str) -> Path:
-        """A Python that prints that in place of what it has."""
+        """Write a Python interpreter that prints `says` instead of running."""
         python = Path(folder) / "bin" / "python"
         python.parent.mkdir(parents=True)
         python.write_text(f"#!/bin/sh\n{says}\n")
@@ -301,16 +301,16 @@ def test_a_machine_on_which_workers_without_a_gpu_could_not_render_is_told(
             "warn",
             "--shm-size=5g",
         ),
-        # Ray caps its store.
+        # Ray limits the size of its store.
         (doctor.judge_shared_memory(total=100 * GB, free=100 * GB, memory=1000 * GB), "ok", ""),
         (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=0.5 * GB), "fail", ""),
         (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=3 * GB), "warn", ""),
         (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=20 * GB), "warn", ""),
         (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=200 * GB), "ok", ""),
-        # Bytes of a socket.
+        # The name of a socket may have 107 bytes.
         (doctor.judge_temp_dir("/tmp/" + "x" * 60, total=100 * GB, free=90 * GB), "fail", "107"),
         (doctor.judge_open_files(1024, 1024), "warn", ""),
-        (doctor.judge_open_files(1024, 1_048_576), "ok", ""),  # as Ray raises them
+        (doctor.judge_open_files(1024, 1_048_576), "ok", ""),  # Ray raises the soft limit
         (doctor.judge_open_files(65536, 65536), "ok", ""),
     ],
 )
@@ -331,7 +331,7 @@ def test_rays_temporary_folder_is_the_one_that_is_judged(
 
 
 def test_a_taken_port_has_another_one_as_cure() -> None:
-    port = free_port()  # no other process takes it meanwhile
+    port = free_port()  # no other process takes this port in the meantime
     with socket.create_server(("127.0.0.1", port)):
         row = doctor.port_free(port)
     assert (row.status, row.detail) == ("warn", "taken")

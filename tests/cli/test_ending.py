@@ -13,7 +13,8 @@ import pytest
 
 from vlagents_ray.ray_tools.signals import interrupts, own_sigterm, stop_signals
 
-# A Ray whose head is lost as soon as somebody looks; `{body}` is what the command does meanwhile.
+# A command with a Ray whose head is lost at the first check; `{body}` is the work of the command in
+# the meantime.
 COMMAND = """
 import atexit, sys, time, types
 sys.modules["ray"] = types.ModuleType("ray")  # not asked here, and a second to import
@@ -47,9 +48,9 @@ typer.run(command)
 @pytest.mark.parametrize(
     ("body", "leave_s"),
     [
-        ("time.sleep(60)", 0.2),  # a call of Ray's that does not return
-        ("time.sleep(0.5); raise EnvFailed('workers do not start')", 30),  # what Ray says of it
-        ("Lost('start it again').answers()", 30),  # noticed by the evaluation itself
+        ("time.sleep(60)", 0.2),  # a call of Ray that does not return
+        ("time.sleep(0.5); raise EnvFailed('workers do not start')", 30),  # Ray's own error
+        ("Lost('start it again').answers()", 30),  # the evaluation itself notices the loss
     ],
     ids=["stuck", "failing", "noticing"],
 )
@@ -90,7 +91,7 @@ def test_one_that_was_interrupted_says_so_though_the_signal_ended_ray_as_well(
 
 
 def test_a_server_that_hangs_while_it_leaves_ends_and_says_where() -> None:
-    """What Ctrl-C had begun once took for ever, and nobody knew what hung."""
+    """In an earlier version, the shutdown after Ctrl-C could hang forever without any message."""
     interrupt = "import os, threading; threading.Timer(0.5, os.kill, (os.getpid(), 2)).start()"
     body = f"{interrupt}; ray_session._END_S = 1.0; loss.wait()"
     ended = run(body, lost="60, Lost")
@@ -101,14 +102,16 @@ def test_a_server_that_hangs_while_it_leaves_ends_and_says_where() -> None:
 
 @pytest.mark.parametrize("number", [2, 15], ids=["Ctrl-C", "SIGTERM"])
 def test_an_interrupt_that_python_drops_ends_the_command_all_the_same(number: int) -> None:
-    """A server that had it in one of Ray's callbacks, as it started, served on for ever."""
+    """An earlier server continued to serve if the signal arrived in one of Ray's callbacks during
+    the start.
+    """
     dropped = (
         f"class Gone:\n            def __del__(self): __import__('signal').raise_signal({number})"
     )
     body = f"{dropped}\n        Gone()\n        atexit.unregister(time.sleep)\n        loss.wait()"
     ended = run(body, lost="60, Lost")
     assert ended.returncode == 130
-    assert "Exception ignored in" in ended.stderr, "it was not dropped"
+    assert "Exception ignored in" in ended.stderr, "Python did not drop the exception"
     assert ended.stderr.endswith("error interrupted\n")
 
 
@@ -125,8 +128,8 @@ def test_an_evaluation_does_not_begin_after_an_interrupt_that_was_dropped() -> N
 def test_sigterm_while_ray_starts_interrupts_the_command() -> None:
     with interrupts():
         with pytest.raises(KeyboardInterrupt), own_sigterm():
-            sys.exit(signal.SIGTERM)  # as the handler of `ray.init` does
-        with pytest.raises(KeyboardInterrupt):  # the command's own handler is back
+            sys.exit(signal.SIGTERM)  # like the handler of `ray.init`
+        with pytest.raises(KeyboardInterrupt):  # the command's own handler is active again
             signal.raise_signal(signal.SIGTERM)
 
 
@@ -161,8 +164,8 @@ def test_ctrl_c_while_modules_are_imported_ends_the_command_without_a_traceback(
 def run(
     body: str, leave_s: float = 30, lost: str = "0.05, Lost"
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command with this body in a separate process; with another period, Ray is well for
-    so long.
+    """Run a command with this body in a separate process. If `lost` begins with a longer period,
+    Ray is not checked for that time.
     """
     code = COMMAND.format(body=body, leave_s=leave_s).replace("0.05, Lost", lost)
     environment = os.environ | {"COLUMNS": "200"}

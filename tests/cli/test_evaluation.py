@@ -1,4 +1,4 @@
-"""What the options of `eval` make of the settings, and what `--dry-run` says that it would take."""
+"""The settings that result from the options of `eval`, and the output of `--dry-run`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ WORDS = ["eval", "tabletop", "--policy", "http://127.0.0.1:9"]
 
 
 def said(*words: str) -> str:
-    """What the command says that is rejected before anything starts."""
+    """Return the output of a command that is rejected before anything starts."""
     done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
     assert done.exit_code == 2, done.output
     return " ".join(done.stderr.split())
@@ -54,7 +54,7 @@ def said(*words: str) -> str:
 def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "vlagents_ray.serve.launch.server.running_server",
-        lambda *_, **__: pytest.fail("started a server"),
+        lambda *_, **__: pytest.fail("the command started a server"),
     )
 
 
@@ -146,7 +146,7 @@ def test_a_file_of_several_policies_is_refused_with_its_cure(tmp_path: Path) -> 
 
 
 def lost(out: Path, **changes: Any) -> EvalConfig:
-    """Record every episode of two cases but one, which infrastructure lost."""
+    """Record all episodes of two cases except one, which is lost for an infrastructure error."""
     of_a = [{"name": "a", "url": "http://127.0.0.1:9"}]
     suites = [{"envs": ["tabletop"], "episodes": 4}]
     config = EvalConfig.model_validate({"policies": of_a, "suites": suites, "out": out, **changes})
@@ -165,7 +165,7 @@ def lost(out: Path, **changes: Any) -> EvalConfig:
 
 
 def end_of(config: EvalConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
-    """The exit status of `eval` and what it said at last, after an evaluation that left these
+    """Return the exit status of `eval` and the end of its output, after an evaluation with these
     results.
     """
     summary = summarize(Results.load(config.out))
@@ -299,7 +299,7 @@ def test_a_dry_run_keeps_warnings_of_what_is_meant_off_the_terminal(
 def test_a_page_has_a_port_of_its_own_if_another_has_the_usual_one() -> None:
     assert live_address("[::1]:9000") == ("::1", 9000)
     with closing(socket.socket()) as taken:
-        with contextlib.suppress(OSError):  # it may be taken already
+        with contextlib.suppress(OSError):  # the port may already be in use
             taken.bind(("127.0.0.1", 8050))
         assert live_address(None) == ("127.0.0.1", 0)
 
@@ -345,7 +345,7 @@ def test_the_plan_is_printed_without_asking_any_policy(
     assert "policy@20" in text
     assert ": unknown" in text
     assert "(no earlier episodes of 4 of 4 cases)" in " ".join(text.split())
-    assert not settings.out.exists(), "nothing is written"
+    assert not settings.out.exists(), "nothing must be written"
 
 
 def test_a_time_that_leaves_out_some_cases_is_a_lower_bound(

@@ -1,4 +1,4 @@
-"""The help of each command has examples, which its parser accepts."""
+"""The help of each command has examples that the command's parser accepts."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from vlagents_ray.cli.typer_help import commands_of, page_of_command
 from vlagents_ray_robot.check_command import command_parser as check_parser
 
 START = "$ vlagents-ray "
-# Its arguments are those of an argparse parser, which has its own examples.
+# This command uses argparse, and has its own examples.
 ROBOT = "robot"
 
 
 def commands(command: Any, name: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield each command with the words of its name."""
+    """Yield each command and its full name."""
     inner = getattr(command, "commands", {})
     if not inner:
         yield name, command
@@ -89,7 +89,7 @@ PAGES["vlagents-ray robot check"] = check_parser().help_page()
 
 @pytest.mark.parametrize("path", sorted(PAGES))
 def test_each_row_of_a_help_is_a_sentence_and_needs_no_second_look(path: str) -> None:
-    plugins = {"Robots (--robot)", "Leaders (--teleop)"}  # lists of names, not of options
+    plugins = {"Robots (--robot)", "Leaders (--teleop)"}  # these panels list names, not options
     rows = [row for panel in PAGES[path].panels if panel.title not in plugins for row in panel.rows]
     for row in rows:
         assert re.fullmatch(r"[A-Z-].*\.", row.about), (row.term, row.about)

@@ -45,7 +45,7 @@ class Stepped(Agent):
             breakpoint()
         return Act(-np.sign(obs.state["position"]) * self.length * self.noise.uniform(0.9, 1.0, 1))
 """
-# As if it were not installed: whatever imports it fails.
+# Simulate an environment without Ray, in which each import of it fails.
 WITHOUT_RAY = "import sys; sys.modules['ray'] = None; from vlagents_ray.cli import main; main()"
 POISON = [sys.executable, "-c", WITHOUT_RAY]
 
@@ -60,13 +60,13 @@ def deployment(**args: object) -> dict[str, object]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working directory, with a policy and two checkpoints of it."""
+    """Return the working directory, with a policy and two of its checkpoints."""
     (tmp_path / "stepped.py").write_text(POLICY)
     for step, length in ((1, 0.5), (2, 1.0)):
         (tmp_path / f"w-{step}.txt").write_text(str(length))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", PYTHONPATH)
-    # Ray sets the latter in a process that connects.
+    # Ray sets PYTHONBREAKPOINT in a process that connects.
     for name in ("RAY_ADDRESS", "PYTHONBREAKPOINT"):
         monkeypatch.delenv(name, raising=False)
     return tmp_path
@@ -149,7 +149,7 @@ def test_what_only_ray_can_do_is_refused(why: str, folder: Path, more: list[str]
     assert not (folder / "runs").exists()
 
 
-# Changes of the plan, options, and the number of workers that follows.
+# For each dry run, the changes of the plan, the options, and the expected number of workers.
 DRY_RUNS = {
     "none": ({}, [], 0),
     "0": ({"workers": 0}, [], 0),
@@ -167,7 +167,9 @@ DRY_RUNS = {
 def test_a_dry_run_names_the_workers_with_which_the_run_itself_is_played(
     dry_run: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also of a policy by name, which becomes an address in a cluster while the plan is made."""
+    """This also holds for a policy given by name, which becomes an address in the cluster while the
+    plan is resolved.
+    """
     changes, words, workers = DRY_RUNS[dry_run]
     for name, more in (
         ("packages", {"runtime_env": {"pip": ["einops"]}}),

@@ -1,4 +1,4 @@
-"""`vlagents-ray init`: what it writes works at once, and what was there stays."""
+"""`vlagents-ray init`: the written files work at once, and existing files are kept."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ def test_a_skeleton_passes_its_own_test(kind: str, folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_next_steps_run_as_they_are_printed_and_without_pytest(kind: str, folder: Path) -> None:
-    """In the environment of `make demo`, which has no pytest; those that serve are tested below."""
+    """The commands run in the environment of `make demo`, which has no pytest. Commands that serve
+    are tested below.
+    """
     status, printed = new(kind, "my_own")
     assert status == 0
     (folder / "absent").mkdir()
@@ -83,7 +85,7 @@ def test_a_skeleton_of_a_plugin_passes_its_own_test_once_it_is_installed(folder:
     assert (status, "pip install --editable ." in printed) == (0, True)
     plugin = folder / "my_plugin"
     environment = ENV | {"PYTHONPATH": f"{plugin}:{ENV.get('PYTHONPATH', '')}"}
-    # What an editable install registers, without an index.
+    # This writes the metadata of an editable install, without a package index.
     metadata = [
         sys.executable,
         "-c",
@@ -134,7 +136,7 @@ def test_a_program_is_named_as_the_shell_finds_it(
 @pytest.mark.server
 @pytest.mark.slow
 def test_a_skeleton_of_a_policy_is_served(folder: Path) -> None:
-    """The steps of one of an environment, which evaluate in it, are run above."""
+    """The steps of an environment's skeleton, which run an evaluation, are tested above."""
     assert new("policy", "my_policy")[0] == 0
     log = folder / "log"
     with serving("my_policy.yaml", log, cwd=folder) as host, RemoteAgent(f"http://{host}") as agent:
@@ -189,7 +191,7 @@ def test_a_name_that_is_no_module_of_ones_own_is_refused(name: str, folder: Path
 def test_a_plugin_of_a_name_that_is_registered_is_refused(
     name: str, kind: str, folder: Path
 ) -> None:
-    """Its own test could not pass."""
+    """The plug-in's own test could not pass."""
     status, said = new("plugin", name)
     assert (status, f"'{name}' is the name of a {kind} already" in said) == (2, True)
     assert list(folder.iterdir()) == []

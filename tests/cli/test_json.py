@@ -1,4 +1,6 @@
-"""`--json` of every command that has it: one document, and nothing else, on stdout."""
+"""The option `--json` of each command that has it: stdout contains one document and nothing
+else.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def offering(command: Any, name: str = "") -> Iterator[str]:
-    """The names of the commands that have the option."""
+    """Return the names of the commands that have the option."""
     for one, below in getattr(command, "commands", {}).items():
         yield from offering(below, f"{name} {one}".strip())
     if any("--json" in param.opts for param in command.params):
@@ -33,7 +35,8 @@ def offering(command: Any, name: str = "") -> Iterator[str]:
 
 def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "checks", lambda *_: [("Ray", Check("fail", "none", "install it"))])
-    monkeypatch.setattr(listing, "env_class", lambda _: Tabletop)  # others load simulators
+    # other environments would load simulators
+    monkeypatch.setattr(listing, "env_class", lambda _: Tabletop)
     policies = [
         {"name": name, "url": f"http://localhost:{port}"} for port, name in enumerate(("a", "b"), 1)
     ]
@@ -67,7 +70,8 @@ def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyP
         {"check": "Ray", "status": "fail", "detail": "none", "cure": "install it"}
     ]
     (pair,) = said["report"]["comparisons"]
-    assert (pair["a"], pair["b"], pair["lines"][-1]["suite"]) == ("b", "a", "all")  # as on the page
+    # the same order as on the page
+    assert (pair["a"], pair["b"], pair["lines"][-1]["suite"]) == ("b", "a", "all")
     assert sum(case["episodes"] for case in said["report"]["cases"]) == 4
     assert not (out / "report.html").exists()
     assert said["verify"]["holds"] is True

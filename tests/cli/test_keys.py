@@ -1,4 +1,4 @@
-"""`vlagents-ray keys`: what it prints, and what it leaves in the file."""
+"""`vlagents-ray keys`: its output, and the resulting file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_key_is_printed_once_listed_without_it_and_revoked(tmp_path: Path) -> 
         "30",
     )
     assert made.exit_code == 0, made.output
-    token = made.stdout.strip()  # nothing else, so that a script can take it
+    token = made.stdout.strip()  # only the key is printed, so that scripts can use the output
     assert Keys.from_file(file).check(token, "pi0").name == "arm"
     with pytest.raises(Forbidden):
         Keys.from_file(file).check(token, "noop")
@@ -85,7 +85,7 @@ def test_mistakes_are_told_in_a_line(words: list[str], text: str, tmp_path: Path
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--host", "0.0.0.0"], "--insecure"),  # noqa: S104 - what is refused
+        (["--host", "0.0.0.0"], "--insecure"),  # noqa: S104 - an address that is rejected
         (["--keys", "nowhere.json"], "keys create"),
         (["--tls-cert", "nowhere.pem"], "--tls-key"),
         (["--tls-cert", "nowhere.pem", "--tls-key", "nowhere.pem"], "PEM"),

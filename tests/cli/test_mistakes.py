@@ -1,5 +1,5 @@
-"""The mistakes that first users make on a command line: each is answered at once, in one message
-with its cure.
+"""Typical mistakes of first users on a command line: each is answered at once, with one message
+that names the cure.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vlagents_ray.cli.main import app
 from vlagents_ray.protocol.values import require_obs
 from vlagents_ray.registry import pip_install
 
-LONGEST_S = 20.0  # of CPU time, for one mistake
+LONGEST_S = 20.0  # CPU time limit for one mistake
 POLICIES = """
 import os
 import numpy as np
@@ -120,8 +120,8 @@ def with_args(**changes: Any) -> str:
     return served(args={"policy": "noop"} | changes)
 
 
-# (words, parts of the message); a text in place of a word is the content of a file x.yaml, which
-# the word names.
+# (words, parts of the message). A text in place of a word is the content of a file x.yaml, whose
+# name becomes the word.
 COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "no command of this name": (["evl"], ["evl", "eval"]),
     "no option of this name": (["eval", "tabletop", "--episods", "3"], ["--episods", "--episodes"]),
@@ -380,9 +380,9 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["'a-b'", "0-9,12"],
     ),
 }
-# Mistakes that are found when the environment is made, after the folder of results.
+# Mistakes that are found when the environment is created, after the folder of results.
 MADE = {"env setting negative"}
-# In this process, until the policy's error: (policy, parts of the message).
+# These run in this process until the policy's error: (policy, parts of the message).
 EPISODES = {
     "WithoutAct": ["act or act_batch"],
     "WrongKey": ["KeyError", "own.py:", "its process wrote the traceback to stderr"],
@@ -421,7 +421,7 @@ def folder(tmp_path: Path, results: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "own", raising=False)
-    # Python writes it beside own.py, which is no result.
+    # Otherwise Python would write a cache next to own.py, which would look like a result.
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     (tmp_path / "own.py").write_text(POLICIES)
     (tmp_path / "syntax.py").write_text("class Policy(:\n")
@@ -443,7 +443,7 @@ def folder(tmp_path: Path, results: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 def answer(words: list[str]) -> tuple[int, str]:
-    """Run a command line in this process; returns its status and message on one line."""
+    """Run a command line in this process, and return its status and its message on one line."""
     began = time.process_time()
     done = CliRunner().invoke(app, words, env={"COLUMNS": "1000", "TERMINAL_WIDTH": "1000"})
     assert time.process_time() - began < LONGEST_S

@@ -1,4 +1,4 @@
-"""Every number that a user can give has bounds, and one outside them is answered at once."""
+"""Each number that a user can set has bounds, and a value outside them is rejected at once."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ OPTIONS = list(numeric_options())
 
 
 def words_before(command: Any) -> list[str]:
-    """Return an argument for each required one of a command, so that only the number is wrong."""
+    """Return a value for each required argument of a command, so that only the tested number is
+    wrong.
+    """
     words: list[str] = []
     for parameter in command.params:
         if parameter.required:
@@ -113,7 +115,7 @@ def test_a_number_inside_a_text_has_bounds(
 
 
 def unbounded(schema: Any, where: str = "") -> Iterator[str]:
-    """Yield the places of numbers in a JSON schema that have no upper bound."""
+    """Yield the places of numbers without an upper bound in a JSON schema."""
     if isinstance(schema, list):
         for part in schema:
             yield from unbounded(part, where)

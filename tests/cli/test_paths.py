@@ -1,4 +1,4 @@
-"""Each option that takes a path, with each wrong path: one message that names the path, and no
+"""Each option with a path, with each kind of wrong path: one message that names the path, and no
 traceback.
 """
 
@@ -17,7 +17,7 @@ from vlagents_ray.cli.main import app
 ROOT = Path(__file__).parents[2]
 
 EPISODE = ["--policy", "scripted", "--episodes", "1", "--workers", "0", "--video", "none"]
-# Command and option -> words in which "{path}" is the path. "done" is a folder with results.
+# Command and option -> words; "{path}" stands for the path, and "done" for a folder with results.
 COMMANDS: dict[tuple[str, str], list[str]] = {
     ("serve", "--keys"): ["noop", "--keys", "{path}"],
     ("serve", "--tls-cert"): ["noop", "--tls-cert", "{path}", "--tls-key", "absent.pem"],
@@ -83,13 +83,13 @@ COMMANDS: dict[tuple[str, str], list[str]] = {
     ("slurm serve", "--setup"): ["noop", "--dry-run", "--out", "o", "--setup", "{path}"],
     ("slurm serve", "--out"): ["noop", "--dry-run", "--out", "{path}"],
 }
-# A file, below a file, below nothing, read-only.
+# A file, a path below a file, a path below a missing folder, and a read-only place.
 PATHS = ["text", "text/below", "folder/absent/below", "/proc/absent"]
-# Results replace a file, and with --dry-run nothing is written.
+# Results replace a file, and --dry-run writes nothing.
 USABLE = {("report", "--out", "text"), ("export", "--out", "text"), ("bundle", "--out", "text")}
 USABLE |= {("slurm serve", "--out", path) for path in PATHS} | {("slurm serve", "--setup", "text")}
 USABLE |= {("slurm eval", "--setup", "text")}
-# A folder that does not exist is made, with its parents.
+# These commands create a missing folder with its parents.
 MADE = {
     "eval",
     "demo",
@@ -122,7 +122,7 @@ def options_with_paths() -> set[tuple[str, str]]:
 
 
 def test_each_option_with_a_path_has_a_row() -> None:
-    # This waits until the folder is made.
+    # `eval --watch` has no row, since it waits until the folder exists.
     assert options_with_paths() == {*COMMANDS, ("eval", "--watch")}
 
 

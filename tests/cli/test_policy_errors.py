@@ -1,5 +1,5 @@
-"""`eval` of policies that fail: the terminal says the error, and the exit status that there is
-no result.
+"""`eval` with policies that fail: the terminal shows the error, and the exit status says that there
+is no result.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ from vlagents_ray.overrides import parse_settings
 
 
 class Failing(ToZero):
-    """Acts with a NaN or misses a key, or only in the episodes of some seeds."""
+    """A policy that returns NaN or reads a missing key, in all episodes or in those of some
+    seeds.
+    """
 
     def __init__(self, how: str, seeds: tuple[int, ...] | None = None) -> None:
         super().__init__()
@@ -78,7 +80,7 @@ def test_a_policy_that_always_fails_says_so_and_ends_with_a_status_of_its_own(
     done = eval_of(tmp_path / "out", functools.partial(Failing, how), monkeypatch)
     assert done.exit_code == run.POLICY_ERRORS, done.output
     failed = [line for line in done.stdout.splitlines() if "counted as no success" in line]
-    assert len(failed) == 1  # once for each cause
+    assert len(failed) == 1  # one message for each cause
     assert WORDS[how] in failed[0]
     [title] = [i for i, line in enumerate(done.stdout.splitlines()) if "Errors of policies" in line]
     [row] = [line for line in done.stdout.splitlines()[title:] if WORDS[how] in line]
@@ -108,7 +110,7 @@ def test_errors_of_the_policy_in_a_row_stop_the_evaluation(
 
 
 class Unstated(EvalEnv):
-    """An environment that states no size of its actions."""
+    """An environment that does not declare the size of its actions."""
 
     max_steps = 4
     contract = Contract()
@@ -125,7 +127,7 @@ class Unstated(EvalEnv):
 
 
 class Shrinking(Agent):
-    """Gives five numbers at first, and three later."""
+    """A policy that returns five numbers at first, and later three."""
 
     acts = 0
 

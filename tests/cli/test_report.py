@@ -1,4 +1,4 @@
-"""`vlagents-ray report`: folders in, one page out."""
+"""`vlagents-ray report` makes one page from one or more folders."""
 
 from __future__ import annotations
 

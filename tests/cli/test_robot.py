@@ -1,5 +1,5 @@
-"""`vlagents-ray robot`: a human at a terminal drives a simulation, or corrects a policy, and it
-is recorded.
+"""`vlagents-ray robot`: a person at a terminal drives a simulation or corrects a policy, and the
+run is recorded.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from vlagents_ray.robot import Watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
 
 MAIN = "from vlagents_ray.cli import main; main()"
-REPEATS = 20  # the loop has ten ticks in that time
+REPEATS = 20  # number of repeats, during which the loop has ten ticks
 QUICK = ["--env", "tabletop/lift", "--env-set", "width=32", "--env-set", "height=32"]
 
 
@@ -46,8 +46,8 @@ def robot(*words: str) -> Any:
 def at_a_terminal(
     code: str, *options: str
 ) -> Iterator[tuple[Any, Callable[[str], object], Iterator[str]]]:
-    """Run Python code at a terminal of its own: its process, a function that types keys there,
-    and its output.
+    """Run Python code at a new terminal. Yield its process, a function that types keys there, and
+    its output.
     """
     ours, its = pty.openpty()
     with subprocess.Popen(
@@ -57,10 +57,10 @@ def at_a_terminal(
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
-        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - nothing else is started meanwhile
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - no other thread runs here
     ) as process:
         assert process.stdout is not None
-        too_long = threading.Timer(60, process.kill)  # then no further line comes
+        too_long = threading.Timer(60, process.kill)  # ends the output if it takes too long
         too_long.start()
         try:
             yield (
@@ -87,13 +87,13 @@ def labels(root: Path) -> list[str]:
 
 
 def until(lines: Iterator[str], text: str) -> None:
-    """Wait until a line has this text."""
+    """Wait for a line with this text."""
     printed = []
     for line in lines:
         printed.append(line)
         if text in line:
             return
-    raise AssertionError(f"{text!r} was not printed: {printed}")
+    raise AssertionError(f"{text!r} is not in the output: {printed}")
 
 
 def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> 
     with at_a_terminal(MAIN, *words) as (process, press, lines):
         for verdict, repeats in (("y", REPEATS), ("x", REPEATS // 2), ("n", REPEATS // 2)):
             until(lines, "seed")
-            for _ in range(repeats):  # as a terminal does while the key is down
+            for _ in range(repeats):  # like a terminal while a key is pressed
                 press("w")
                 time.sleep(0.05)
             press(verdict)
@@ -132,9 +132,9 @@ def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
         until(lines, "the policy moves the robot")
         press("s")
         until(lines, "you move the robot")
-        press("\n")  # gives back
+        press("\n")  # return control
         until(lines, "the policy moves the robot")
-        until(lines, "success")  # the policy solves it after the correction
+        until(lines, "success")  # the policy solves the task after the correction
         until(lines, "seed")
         press("q")
         assert process.wait(30) == 0
@@ -189,7 +189,7 @@ def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=60)
     kept = len(list(tmp_path.glob("data/*/*.parquet")))
-    assert kept in (2, 3), "with the running one, if it had begun"
+    assert kept in (2, 3), "would wait for the running loop if it had begun"
     assert (process.returncode, said.decode()) == (
         130,
         f"error interrupted; {kept} episodes are in {tmp_path}\n",
@@ -238,7 +238,7 @@ def test_a_person_restarts_the_command_by_a_signal() -> None:
     ):
         assert stopped.wait(30)
         os.kill(os.getpid(), signal.SIGUSR1)
-        assert watchdog.control.stopped  # it hangs still
+        assert watchdog.control.stopped  # the loop still hangs
         watchdog._limits["loop"] = 60.0
         watchdog.heard("loop")
         assert watchdog.control.stopped
@@ -278,7 +278,7 @@ with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, _restarting(
 
 
 def test_with_a_keyboard_as_leader_each_key_has_one_consumer_and_enter_restarts_nothing() -> None:
-    """The command line of docs/interventions.md, whose server is a policy in its process."""
+    """The command line of docs/interventions.md, with a policy in its process."""
     code = """
 import sys
 import vlagents_ray.cli.robot as command
@@ -320,7 +320,7 @@ sys.exit(command.main(sys.argv[1:]))
         type_keys("\n\nc")
         said = list(itertools.islice(lines, 24))
         assert said[:20] == ["keyboard 'w' True"] * 20
-        assert said[20:22] == [r"keyboard '\n' True"] * 2, "Enter gives back and takes over"
+        assert said[20:22] == [r"keyboard '\n' True"] * 2, "Enter returns control and takes it over"
         assert said[22:] == ["keyboard 'c' False", "restarted"]
         process.send_signal(signal.SIGTERM)
         assert process.wait(30) == 128 + signal.SIGTERM
@@ -353,9 +353,7 @@ command.main(["http://nowhere"])
 
 
 class Served(Agent):
-    """In place of the agent that the command would connect: absolute targets that grow by 0.01 a
-    tick.
-    """
+    """A stand-in for the connected agent, with absolute targets that grow by 0.01 per tick."""
 
     transport = "local"
     contract: Contract | None = Contract(action=ActionSpec(dim=2, delta=False), chunk=1)  # type: ignore[assignment]
@@ -372,7 +370,7 @@ class Served(Agent):
 
 @pytest.fixture
 def served(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Let the command connect an agent with these attributes."""
+    """Let the command connect to an agent with these attributes."""
 
     def serve(**attributes: Any) -> None:
         for name, value in attributes.items():
@@ -416,7 +414,7 @@ def test_a_signal_whose_exception_python_drops_ends_the_loop_before_its_next_tic
 
 
 SHORT = ["http://nowhere", "--seconds", "1"]
-ATTEMPTS = 5  # what else the machine does in such a second may mislead
+ATTEMPTS = 5  # other work of the machine may disturb such a short run
 
 
 @pytest.mark.parametrize("mode", ["async", "open_loop", "ensemble"])
@@ -431,7 +429,7 @@ def test_a_policy_of_single_actions_drives_in_each_mode(
         )
         assert said is not None
         safe, ticks = map(int, said.groups())
-        if safe < 0.5 * ticks:  # none where the machine is not busy
+        if safe < 0.5 * ticks:  # no safe ticks on an idle machine
             break
     assert safe < 0.5 * ticks
     assert status == (1 if safe else 0)
@@ -461,7 +459,7 @@ def test_a_run_of_safe_actions_does_not_look_like_success(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     served(slow_s=0.3)
-    for _ in range(ATTEMPTS):  # on a busy machine there may be hardly a tick within the time
+    for _ in range(ATTEMPTS):  # on a busy machine the run may have hardly any ticks
         status = drive(SHORT)
         said = capsys.readouterr()
         if status == 3:
@@ -569,7 +567,7 @@ def test_options_are_checked_before_a_server_is_asked(
     assert status == 2
     said = capsys.readouterr().err
     assert wanted in said
-    assert said.count("\n") <= 4, "an error does not list all options"
+    assert said.count("\n") <= 4, "an error must not list all options"
 
 
 def test_an_address_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
@@ -670,12 +668,14 @@ def test_the_keys_on_an_arm_are_named_at_the_start_and_end_and_label_the_run(
         until(lines, "the policy continues")
         press(key)
         said = "\n".join(lines)
-        assert process.wait(30) in (status, 1), "a tick without an action of the policy ends with 1"
+        assert process.wait(30) in (status, 1), (
+            "a run with a tick without an action of the policy must end with 1"
+        )
     assert "Traceback" not in said
     stopped, closed = re.search(r"stops after (\d+)", said), re.search(r"closed after (\d+)", said)
     assert stopped is not None
     assert closed is not None
-    assert stopped[1] == closed[1], "nothing moved the arm after the key"
+    assert stopped[1] == closed[1], "the arm must not move after the key"
     assert f"recorded: {int(label is not None)} episodes" in said
     if label is not None:
         assert labels(tmp_path / "demos") == [label]
@@ -690,7 +690,7 @@ def test_without_a_terminal_the_command_says_so() -> None:
 
 
 class FaultyArm(Served):
-    """An arm that cannot be made."""
+    """An arm whose constructor fails."""
 
     def __init__(self, port: str = "") -> None:
         raise OSError(f"[Errno 2] could not open port {port}")

@@ -1,4 +1,4 @@
-"""What `vlagents-ray serve` says, and what it keeps in a file."""
+"""The output of `vlagents-ray serve`, and its log file."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ INFO = (
 MEANT = ("WARNING 2026-11-21 17:02:48,881 controller 3438 -- HTTPOptions.host='127.0.0.1' won't "
          "accept connections from HAProxy on other nodes; cross-node routing will fail")  # fmt: skip
 PROBLEM = "ERROR 2026-11-21 17:02:51,406 controller 3438 -- Deploying app 'x' failed"
-PRINTED = "INFO: loading the weights"  # by a policy
+PRINTED = "INFO: loading the weights"  # printed by a policy
 HAPROXY = "HAProxyManager pid=7"
 
 
 class Processes:
-    """The processes of a Ray that this process started, and what they write to its log files."""
+    """Stand-ins for the processes of this process's Ray, and their output in log files."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -100,8 +100,8 @@ def test_only_problems_and_what_a_policy_prints_are_shown_and_the_rest_is_in_the
 def test_after_an_interrupt_what_serves_actors_print_goes_to_the_log_and_what_a_policy_prints_is_shown(
     ray: Processes, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A signal to the whole process group also ends HAProxy, and Serve's actors print tracebacks
-    of its crash.
+    """A signal to the whole process group also ends HAProxy, after which Serve's actors print
+    tracebacks of its crash.
     """
     monkeypatch.setattr("vlagents_ray.cli.ray_session.is_interrupted", lambda: True)
     crash = "RuntimeError: Failed to update and reload HAProxy"
@@ -175,7 +175,7 @@ def test_the_traceback_of_a_policy_that_does_not_load_is_in_the_file_until_the_s
         return said
 
     with pytest.raises(ConfigError), quiet_ray("serve", started) as file:  # noqa: PT012
-        for count in range(len(LOAD_FAILURE)):  # a few lines are read at a time
+        for count in range(len(LOAD_FAILURE)):  # the reader gets a few lines at a time
             ray.say(LOAD_FAILURE[count])
             ray.say(PRINTED, pid=2)
             wait_for(lambda: len(shown()) > count)  # noqa: B023 - called at once
@@ -225,7 +225,7 @@ def test_a_server_names_the_pages_of_the_parts_that_are_on(monkeypatch: pytest.M
 
     assert pages() == ["  live page: http://127.0.0.1:8000/live"]
     assert pages(parts={"live": None}) == []
-    assert pages(access={"insecure": True}) == [], "it would show nothing"
+    assert pages(access={"insecure": True}) == [], "the command would show nothing"
     monkeypatch.setattr(registry, "_entry_points", lambda _: {})
     assert pages() == [], "the plug-in is not installed"
 

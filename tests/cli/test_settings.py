@@ -1,5 +1,5 @@
-"""Own modules are found where the command is typed, and what is mistyped is said before anything
-starts.
+"""A user's modules are found in the working directory of the command, and mistyped settings are
+reported before anything starts.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ RUNS: dict[str, dict[str, object]] = {
     "low": {"workers": -1},
     "listed": {"suites": [{"envs": ["tabletop"], "episods": 3}]},
 }
-# What the console script does, whose first entry of `sys.path` is its own folder and not the
+# The code of the console script. The first entry of its `sys.path` is the script's folder, not the
 # working directory.
 SCRIPT = """
 import sys
@@ -73,7 +73,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 def said_by_a_process(folder: Path, *words: str, **variables: str) -> str:
-    """What the command says, typed in that folder, that fails before anything starts."""
+    """Return the output of a command that is started in `folder` and fails before anything
+    starts.
+    """
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, str(ROOT), *words],
@@ -89,7 +91,7 @@ def said_by_a_process(folder: Path, *words: str, **variables: str) -> str:
 
 
 def said_by(*words: str) -> str:
-    """The same, in this process."""
+    """Return the output of the command in this process."""
     done = CliRunner().invoke(app, words, env={"COLUMNS": "40"})
     assert done.exit_code == 2, done.output
     return done.stderr
@@ -259,7 +261,7 @@ def test_modules_are_found_in_the_folder_where_a_command_is_typed_unless_python_
     assert "module 'my_policies' has no class 'Reech'" in said_by_a_process(
         folder, "serve", words[0]
     )
-    if sys.version_info >= (3, 11):  # Python 3.10 does not know PYTHONSAFEPATH
+    if sys.version_info >= (3, 11):  # Python 3.10 ignores PYTHONSAFEPATH
         assert "no module 'my_policies'" in said_by_a_process(
             folder, "robot", *words, PYTHONSAFEPATH="1"
         )

@@ -1,5 +1,5 @@
-"""A server with two replicas starts and stops without a word of an error, prints where its metrics
-are, and gives the robots of its WebSockets a reason when it stops.
+"""A server with two replicas starts and stops without error messages, prints the address of its
+metrics, and sends its WebSocket clients a reason when it stops.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
 
 pytestmark = [pytest.mark.server, pytest.mark.slow]
 SERIES = "ray_vlagents_sessions"
-# Ray warns, truly, if a replica of a busy machine does not return the length of its queue within
-# 0.1 s. Servers keep that limit, within which a router leaves a replica that hangs.
+# Ray warns, rightly, if a replica on a busy machine does not report the length of its queue within
+# 0.1 s. Servers keep this limit, since after it a router skips a replica that hangs.
 QUEUE_LENGTH_S = {"RAY_SERVE_QUEUE_LENGTH_RESPONSE_DEADLINE_S": "60"}
 
 
 def test_two_replicas_start_and_stop_in_silence_and_close_websockets_with_a_reason(
     tmp_path: Path,
 ) -> None:
-    """Serve ends HAProxy, and with it all connections, before the replicas if both end at once."""
+    """If both end at once, Serve ends HAProxy, and with it all connections, before the replicas."""
     application = {"import_path": IMPORT_PATH, "args": {"policy": "noop", "replicas": 2}}
     (tmp_path / "two.yaml").write_text(yaml.safe_dump({"applications": [application]}))
     port = free_address().rpartition(":")[2]
@@ -59,7 +59,7 @@ def test_two_replicas_start_and_stop_in_silence_and_close_websockets_with_a_reas
         assert server.poll() is None, log.read_text()
         [url] = re.findall(r"^metrics for Prometheus: (http://\S+)$", log.read_text(), re.MULTILINE)
         wait_for(lambda: SERIES in metrics(url), START_S)
-        # Before the last line, it might go through Serve's own proxy.
+        # Before this line is printed, the connection might go through Serve's own proxy.
         websocket = connect(f"ws://127.0.0.1:{port}/v1/stream")
     finally:
         server.send_signal(signal.SIGTERM)

@@ -1,4 +1,4 @@
-"""What is wrong with a file for `--watch` is said before anything is looked for."""
+"""Errors in a file for `--watch` are reported before any checkpoint is searched for."""
 
 from __future__ import annotations
 
@@ -99,16 +99,16 @@ FAMILIES = sorted(
 
 
 def needed(family: str) -> dict[str, Any]:
-    """Return a value for each setting without a default, beside the checkpoint: all of these are
-    texts.
+    """Return a value for each setting without a default, except the checkpoint. All of these
+    settings are texts.
     """
     fields = policy_class(family).Config.model_fields.items()
     return {name: "any" for name, field in fields if field.is_required() and name != "checkpoint"}
 
 
 def swept(family: str, tmp_path: Path, place: str, **settings: Any) -> EvalConfig:
-    """A sweep over one policy, whose settings are in the evaluation's file or in the deployment
-    file.
+    """Return a sweep over one policy, whose settings are in the evaluation's file or in the
+    deployment file.
     """
     own = {"checkpoint": "/runs/{step}/pretrained_model", **needed(family), **settings}
     policy: dict[str, Any] = {"name": "swept", "source": family, "config": own}

@@ -1,4 +1,4 @@
-"""RemoteAgent before there is a server: what its URL and options mean."""
+"""RemoteAgent before a server exists: the meaning of its URL and options."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def test_commands_are_obeyed_and_answered_once_an_answer_has_come() -> None:
     answers = {f"id of {do}": "" for do in ("pause", "stop", "success")}
     assert inbox.with_outcomes(Obs(info={"a": 1})).info == {"a": 1, COMMANDED: answers}
     inbox.receive(PolicyFailed("lost"))
-    # again, as the first may not have arrived.
+    # sent again, since the first message may have been lost
     assert inbox.with_outcomes(Obs()).info == {COMMANDED: answers}
     inbox.receive(Act(np.zeros(2, np.float32)))
     assert inbox.with_outcomes(Obs()).info == {}

@@ -42,7 +42,7 @@ class Failing(Agent):
 
 
 def serve(how: str) -> None:
-    """Print the port, and serve until the standard input ends."""
+    """Serve a policy, print the port, and stop when the standard input ends."""
     engine = Engine(Failing(how))
     local = ShmServer(engine, DEFAULT_LIMITS, NoKey.OPEN)
     stream = OwnPortServer(engine, DEFAULT_LIMITS, "127.0.0.1", None, NoKey.OPEN)
@@ -60,12 +60,12 @@ def serve(how: str) -> None:
     with served(AccessMiddleware(app, None, "failing")) as port:
         print(port, flush=True)
         sys.stdin.read()
-        os._exit(0)  # the policy's thread hangs
+        os._exit(0)  # a normal exit would wait for the policy's thread
 
 
 @contextlib.contextmanager
 def failing_server(how: str) -> Iterator[str]:
-    """Serve in another process; yield the URL."""
+    """Serve in another process, and yield the URL."""
     folders = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1] / "support")]
     path = os.pathsep.join([*folders, os.environ.get("PYTHONPATH", "")])
     process = subprocess.Popen(

@@ -1,5 +1,5 @@
-"""The change on the page of other clients that makes workers of Anyscale's template
-`groot-ray-serve` clients of this server.
+"""The change in docs that turns workers of Anyscale's template `groot-ray-serve` into clients of
+this server.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vlagents_ray import Act, Agent, Obs
 
 PAGE = Path(__file__).parents[2] / "docs" / "clients" / "gr00t.md"
 INSTRUCTION = "pick up the apple and place it on the plate"
-WIDTHS = {  # widths of an action of the template's server, by the comment of its `policy_server.py`
+WIDTHS = {  # widths of the action's parts, as documented in the template's `policy_server.py`
     "left_wrist_eef_9d": 9,
     "right_wrist_eef_9d": 9,
     "left_hand": 7,
@@ -32,9 +32,9 @@ ROWS = 40
 
 
 class Humanoid(Agent):
-    """Acts with numbers that no two columns or calls share, and keeps what it was sent."""
+    """A policy whose numbers differ in all columns and calls, and that stores its observations."""
 
-    # Of all sessions, each of which has a copy of the policy.
+    # Instructions of all sessions, each of which has a copy of the policy.
     instructions: ClassVar[list[str | None]] = []
     observations: ClassVar[list[Obs]] = []
 
@@ -52,7 +52,7 @@ class Humanoid(Agent):
 
 
 def observation(pixel: int) -> dict[str, Any]:
-    """What the template's `G1LocomanipulationEnv` returns."""
+    """Return an observation of the template's `G1LocomanipulationEnv`."""
     frames = np.full((1, 2, 48, 64, 3), pixel, np.uint8)
     state = {
         name: np.full((1, 1, width), pixel + number, np.float32)
@@ -67,7 +67,9 @@ def observation(pixel: int) -> dict[str, Any]:
 
 @pytest.fixture
 def worker(tmp_path: Path) -> dict[str, Any]:
-    """The names of the page's block, in a module that has imported numpy, as `sim_worker.py`."""
+    """Return the names that the page's block defines, in a module with numpy, like
+    `sim_worker.py`.
+    """
     [block] = [block for block in blocks(PAGE.read_text()) if "def query_policy" in block.source]
     module = tmp_path / "sim_worker.py"
     module.write_text(f"import numpy as np\n{block.source}\n")

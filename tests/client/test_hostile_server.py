@@ -1,5 +1,5 @@
 """Servers that send values of wrong types, or answer byte by byte: a client raises the package's
-errors, in time.
+errors in time.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ ADDRESSES = {
     "local": {"socket": "vlagents-ray-none", "boot_id": "another machine", "keyed": False},
     "stream": {"port": 1, "path": "/v1/stream/x"},
 }
-# A value of each type of JSON, references to blobs, and numbers beyond what the types of C hold.
+# A value of each JSON type, references to blobs, and numbers beyond the range of C's types.
 VALUES: list[Any] = [
     None,
     True,
@@ -66,7 +66,7 @@ VALUES: list[Any] = [
     {"$": []},
 ]
 TIME_LIMIT_S = 1.0
-DRIP_S = 0.2  # between two bytes
+DRIP_S = 0.2  # time between two bytes
 
 
 def places(node: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -134,7 +134,7 @@ def test_a_reply_with_a_value_of_any_type_at_any_place_is_read_or_malformed(repl
 
 @contextlib.contextmanager
 def tcp_server(answer: Callable[[socket.socket], None]) -> Iterator[int]:
-    """Run `answer` on a thread for each connection; yields the port."""
+    """Run `answer` in a thread for each connection, and yield the port."""
     connections: list[socket.socket] = []
 
     def run(connection: socket.socket) -> None:
@@ -159,7 +159,7 @@ def tcp_server(answer: Callable[[socket.socket], None]) -> Iterator[int]:
 
 
 def read_request(connection: socket.socket) -> str:
-    """Read one request; returns its path."""
+    """Read one request, and return its path."""
     data = b""
     while b"\r\n\r\n" not in data:
         data += received(connection)
@@ -188,7 +188,7 @@ def response(body: bytes, media_type: str, status: str = "200 OK") -> bytes:
 
 @contextlib.contextmanager
 def http_policy(metadata: Any, act: bytes, status: str = "200 OK") -> Iterator[str]:
-    """Serve metadata, resets, and one answer to each act; yields the URL."""
+    """Serve metadata, resets, and one answer to each act; yield the URL."""
     document = metadata if isinstance(metadata, bytes) else json.dumps(metadata).encode()
     answers = {
         "/v1/metadata": response(document, "application/json"),
@@ -259,14 +259,14 @@ def test_deeply_nested_json_is_an_error_of_the_package(status: str) -> None:
 
 
 def drip(connection: socket.socket, data: bytes) -> None:
-    """Send one byte after the other, for longer than any client here waits in all."""
+    """Send one byte after the other, for longer than any client's time limit."""
     for byte in data * 100:
         connection.sendall(bytes([byte]))
         time.sleep(DRIP_S)
 
 
 def drip_at(state: str, metadata: bytes) -> Callable[[socket.socket], None]:
-    """Return a server that answers byte by byte from `state` of the answer to a reset on."""
+    """Return a server that answers byte by byte from the given `state` of the answer to a reset."""
     complete = {
         "status line": b"",
         "headers": b"HTTP/1.1 200 OK\r\n",
@@ -311,7 +311,7 @@ def test_a_server_that_answers_byte_by_byte_keeps_no_client_beyond_its_time(
         begun = time.monotonic()
         with pytest.raises(VLAgentsError, match="no answer within 1 s"):
             act_once(url) if client == "remote agent" else act_upstream(url)
-        # Without the limit, the answer takes 100 times as long as its first bytes.
+        # Without the limit, the answer would take 100 times as long as its first bytes.
         assert time.monotonic() - begun < 20 * TIME_LIMIT_S
 
 

@@ -1,4 +1,6 @@
-"""The client that people copy: it imports nothing of this package, and speaks to a real server."""
+"""The minimal client that users copy: it imports nothing of this package, and works with a real
+server.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
 
 
 class Seeing(Agent):
-    """Answers with the means of what it sees; a joint above 1 is an error, one below -1 takes
-    `SLOW_S`.
+    """A policy that returns the means of its images. A joint above 1 raises an error, and a joint
+    below -1 takes `SLOW_S`.
     """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -31,7 +33,7 @@ class Seeing(Agent):
     def act(self, obs: Obs) -> Act:
         joint = float(obs.state["joints"][0])
         if joint > 1:
-            raise RuntimeError("the arm is elsewhere")
+            raise RuntimeError("the arm is at another position")
         if joint < -1:
             time.sleep(SLOW_S)
         seen = [float(image.mean()) for image in obs.cameras.values()]

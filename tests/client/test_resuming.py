@@ -1,5 +1,5 @@
-"""A session over the loss of its replica, and many sessions over one connection; no Ray, no
-sockets.
+"""A session that survives the loss of its replica, and many sessions over one connection, without
+Ray or sockets.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from vlagents_ray.serve.scaling import session_migration
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
-    """The client's."""
+    """Simulate the client's clock."""
     clock = SimulatedTime()
     for module in (connection, recovery):
         monkeypatch.setattr(module, "time", clock)
@@ -47,7 +47,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
 
 
 class Window(Agent):
-    """Acts on the last three values that it saw, and counts its acts."""
+    """A policy that acts on the last three observed values, and counts its acts."""
 
     contract = Contract(history=3)
 
@@ -88,8 +88,8 @@ Begun = Callable[..., tuple[Replicas, RemoteAgent]]
 
 @pytest.fixture
 def begun(replicas: Callable[[int], Replicas]) -> Iterator[Begun]:
-    """Some replicas and a session that begins at the first of them, with frame 1 and the
-    instruction "stack".
+    """Return a function that starts replicas and a session at the first of them, with frame 1 and
+    the instruction "stack".
     """
     with contextlib.ExitStack() as made:
 
@@ -113,7 +113,9 @@ def test_a_session_of_a_replica_that_stops_moves_with_all_it_has(begun: Begun) -
 
 
 def act_until_moved(agent: RemoteAgent, served: Replicas) -> list[float]:
-    """Act until the second replica has the session, which continues; return what it drew."""
+    """Act until the session has moved to the second replica and continues there; return the drawn
+    numbers.
+    """
     drawn = []
     while not len(served.engines[1].sessions):
         act = agent.act(obs(len(drawn) % 200))
@@ -126,7 +128,9 @@ def act_until_moved(agent: RemoteAgent, served: Replicas) -> list[float]:
 def test_a_session_stays_where_it_is_until_another_replica_has_answered(
     look_up: str, begun: Begun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A replica that sends it away continues answering, while the load balancer may be gone."""
+    """A replica that sends the session away still answers, even if the load balancer is
+    unavailable.
+    """
     served, agent = begun(2, timeout_s=5.0, seed=3)
     connect, tried, back = InProcess.connect, threading.Semaphore(0), threading.Event()
 
@@ -153,7 +157,7 @@ def test_a_session_stays_where_it_is_until_another_replica_has_answered(
     assert agent.reconnects == 0
     back.set()
     drawn += act_until_moved(agent, served)
-    # Not one act was lost or repeated.
+    # No act was lost or repeated.
     assert drawn == np.random.default_rng(3).random(len(drawn)).tolist()
 
 
@@ -195,7 +199,8 @@ def test_a_session_of_a_dead_replica_begins_again_and_sees_its_history(
     frame = obs(1)
     agent.reset(frame, "stack", seed=3)
     for value in (2, 3, 4):
-        frame.cameras["front"][:] = value  # an env that renders into the same memory each time
+        # like an environment that always renders into the same memory
+        frame.cameras["front"][:] = value
         agent.act(frame)
     served.dead.add(0)
     act = agent.act(obs(5))
@@ -231,7 +236,7 @@ def test_the_first_action_since_says_that_the_session_began_again_though_its_own
 def test_a_session_that_did_not_begin_again_in_time_says_so_with_the_next_act(
     executed: bool, begun: Begun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside load the reset's deadline passes, and the next act comes while the reset is in the
+    """Under load the reset's deadline passes, and the next act arrives while the reset is in the
     queue, or after it.
     """
     served, agent = begun(2)
@@ -250,7 +255,7 @@ def test_a_session_that_did_not_begin_again_in_time_says_so_with_the_next_act(
     monkeypatch.setattr(InProcess, "call", too_late)
     with pytest.raises(DeadlineExceeded):
         agent.act(obs(2))
-    assert not late, "it was not to begin again"
+    assert not late, "the session was not reset"
     act = agent.act(obs(3))
     assert (act.info["resumed"], act.info["instruction"], act.info["acts"]) == (True, "stack", 1)
 
@@ -258,7 +263,7 @@ def test_a_session_that_did_not_begin_again_in_time_says_so_with_the_next_act(
 def test_an_act_without_time_to_begin_again_exceeds_its_deadline_and_asks_for_no_reset(
     begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
-    """Another replica has looked for the session until the deadline, and says then that it is
+    """Another replica searches for the session until the deadline, and then reports that it is
     unknown.
     """
     served, agent = begun(2)
@@ -283,7 +288,7 @@ def test_an_act_without_time_to_begin_again_exceeds_its_deadline_and_asks_for_no
 def test_an_act_for_which_little_time_is_left_is_not_sent_again(
     begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
-    """It would arrive, and be executed, when its caller has given up."""
+    """The act would be executed after its caller has given up."""
     served, agent = begun(2)
     served.dead.add(0)
     call, sent = InProcess.call, []
@@ -307,7 +312,7 @@ def test_an_act_for_which_little_time_is_left_is_not_sent_again(
 def test_a_reset_waits_for_a_replica_while_none_runs_but_not_for_room_at_a_full_one(
     replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    not_found = UnknownApp("Path '/v1/reset' not found")  # of HAProxy, while it restarts
+    not_found = UnknownApp("Path '/v1/reset' not found")  # HAProxy's answer while it restarts
     refusals: list[VLAgentsError] = [PolicyUnavailable("full"), NoReplica("none runs"), not_found]
     call = InProcess.call
 
@@ -402,7 +407,7 @@ def test_the_server_gives_a_call_up_before_its_caller_does(
     replicas: Callable[[int], Replicas],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """By a handle, and over HTTP, nobody knows how long a request was under way: it was acted on
+    """Over a handle and over HTTP, the travel time of a request is unknown, so it could be executed
     after its deadline.
     """
     agent = replicas(1).agent()
@@ -493,7 +498,7 @@ def test_a_replica_that_has_fallen_silent_is_left(
             break
         except DeadlineExceeded:
             failed += 1
-    assert failed == 3  # one late answer says nothing yet
+    assert failed == 3  # one late answer proves nothing yet
     assert act.info["resumed"]
     assert act.action.tolist() == [1, 2, 3]
     assert "resumed" not in agent.act(obs(4)).info
@@ -503,7 +508,9 @@ def test_a_replica_that_has_fallen_silent_is_left(
 def test_a_session_that_has_left_a_silent_replica_begins_again_without_a_search(
     begun: Begun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Too late for its own call, whose error says so; the next one begins with a reset."""
+    """The recovery comes too late for the call itself, whose error says so. The next call begins
+    with a reset.
+    """
     served, agent = begun(2)
     agent.act(obs(2))
     call, ops = InProcess.call, []
@@ -556,8 +563,8 @@ def test_a_call_that_connects_again_too_late_sends_nothing_and_the_next_one_has_
 def test_a_server_that_has_just_answered_is_not_left_for_the_silence_before_that(
     waits: bool, begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
-    """It was: the first late answer on a new connection, which is slow to begin with, threw that
-    away.
+    """An earlier version left the server: the first late answer on a new connection, which is slow
+    at first, overrode the recent answer.
     """
     _, agent = begun(1, timeout_s=2.0)
     late, lost = DeadlineExceeded("no answer"), ConnectionLost("gone")
@@ -588,10 +595,11 @@ def test_a_replica_that_is_only_slow_keeps_the_session_or_gives_it_on(
         if not slow:
             return call(self, requests, timeout_s)
         clock.now += connection.SILENT_S
-        return call(self, requests, 0.1)  # of the 30 s in which it may act on it
+        return call(self, requests, 0.1)  # less than the 30 s in which the replica may act
 
     monkeypatch.setattr(InProcess, "call", too_late)
-    for number, prefer in ((1, 0), (2, 1)):  # it goes to the same one again, or to another one
+    # the client connects to the same replica again, or to another one
+    for number, prefer in ((1, 0), (2, 1)):
         served = replicas(number)
         agent = served.agent()
         agent.reset(obs(1), "stack")
@@ -600,7 +608,7 @@ def test_a_replica_that_is_only_slow_keeps_the_session_or_gives_it_on(
         model = next(iter(served.engines[0].models._cache.loaded.values()))
         slow = True
         with model.busy, pytest.raises(DeadlineExceeded):
-            agent.act(obs(2))  # which is acted on later
+            agent.act(obs(2))  # this act is executed later
         slow = False
         act = agent.act(obs(3))
         assert "resumed" not in act.info

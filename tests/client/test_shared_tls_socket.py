@@ -17,13 +17,15 @@ from eval_fakes import wait_for
 
 from vlagents_ray.client.shared_tls_socket import SharedTlsSocket
 
-SIZE = 4 * 1024 * 1024  # more than the kernel takes at once
+SIZE = 4 * 1024 * 1024  # more than the kernel's buffers take
 LIMIT_S = 0.3
 
 
 @contextlib.contextmanager
 def connection(folder: Path) -> Iterator[tuple[SharedTlsSocket, ssl.SSLSocket]]:
-    """The two ends of a connection: the client's, and the server's, which nothing reads yet."""
+    """Yield the two ends of a connection, the client's and the server's. Nothing reads the server's
+    end yet.
+    """
     ours = authority(folder, "ours")
     server_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server_context.load_cert_chain(*ours.sign("server"))
@@ -46,7 +48,7 @@ def connection(folder: Path) -> Iterator[tuple[SharedTlsSocket, ssl.SSLSocket]]:
 
 
 def received(end: SharedTlsSocket | ssl.SSLSocket, size: int) -> bytes:
-    """Read so many bytes."""
+    """Read `size` bytes."""
     data = bytearray()
     while len(data) < size:
         piece = end.recv(65536)
@@ -56,7 +58,7 @@ def received(end: SharedTlsSocket | ssl.SSLSocket, size: int) -> bytes:
 
 
 def test_a_thread_writes_while_another_one_reads(tmp_path: Path) -> None:
-    """Both ends send at once, and far more than the kernel takes."""
+    """Both ends send at the same time, and much more than the kernel's buffers take."""
     to_server, to_client = os.urandom(SIZE), os.urandom(SIZE)
     read: dict[str, bytes] = {}
     with connection(tmp_path) as (client, server):
@@ -93,7 +95,7 @@ def test_closing_ends_a_read_that_waits(tmp_path: Path) -> None:
         begun = time.monotonic()
         client.close()
         wait_for(lambda: not reading.is_alive(), 10)
-        assert time.monotonic() - begun < 0.9  # it does not wait until it looks again
+        assert time.monotonic() - begun < 0.9  # it does not wait for its next check
     assert len(ends) == 1
     with pytest.raises(OSError, match="Bad file descriptor"):
         client.recv(10)

@@ -1,5 +1,5 @@
-"""A policy that stalls, and where the robot continues afterwards. Time is counted in ticks; no
-clock is read.
+"""A policy that stalls, and the robot's position afterwards. Time is counted in ticks; no clock is
+used.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from vlagents_ray.robot import Guard
 
 HZ = 50
 ROWS = 20
-ANSWER = 5  # ticks that an answer takes
-STALLS = [30, 150]  # ticks: 0.6 s and 3 s
-GOAL, GAIN = 3.0, 0.004  # the way to the goal that is made in a tick
+ANSWER = 5  # number of ticks until an answer
+STALLS = [30, 150]  # ticks; 0.6 s and 3 s
+GOAL, GAIN = 3.0, 0.004  # goal, and the share of the distance to it that is travelled per tick
 
 
 class Approaching(Agent):
-    """Plans the way to the goal from where it sees the robot: each row a little shorter than the
-    one before.
+    """A policy that plans the path from the observed position to the goal. Each row is slightly
+    shorter than the row before.
     """
 
     def __init__(self, delta: bool) -> None:
@@ -59,7 +59,7 @@ class Approaching(Agent):
 
 
 class Delayed(Agent):
-    """Between a player and its policy: an answer comes when the test lets it."""
+    """A layer between a player and its policy, whose answers a test releases."""
 
     def __init__(self, agent: Agent) -> None:
         self.agent = agent
@@ -75,7 +75,7 @@ class Delayed(Agent):
 
     def act(self, obs: Obs) -> Act:
         self.asked += 1
-        if self.asked > 1:  # the first is what `reset` waits for
+        if self.asked > 1:  # `reset` waits for the first answer
             self.called.release()
             assert self.gate.acquire(timeout=60)
         return self.agent.act(obs)
@@ -85,9 +85,9 @@ class Delayed(Agent):
 
 
 class Run(NamedTuple):
-    at: np.ndarray  # (T,) where the robot was at each tick
-    moved: np.ndarray  # (T,) and how far it went
-    fresh: int  # tick at which the stalled answer came
+    at: np.ndarray  # (T,) position of the robot at each tick
+    moved: np.ndarray  # (T,) distance moved at each tick
+    fresh: int  # tick at which the stalled answer arrived
 
 
 def drive(
@@ -97,14 +97,14 @@ def drive(
     check: Guard | None,
     stalled: Callable[[], None] = lambda: None,
 ) -> Run:
-    """The robot goes exactly where it is commanded. The sixth answer takes `stall` ticks, all
-    others `ANSWER`.
+    """Drive a robot that follows its commands exactly. The sixth answer takes `stall` ticks, and
+    all others `ANSWER`.
     """
     delayed = Delayed(agent)
     at: list[float] = []
     moved: list[float] = []
     position, fresh = 0.0, 0
-    due: int | None = None  # tick at which the request under way is answered
+    due: int | None = None  # tick at which the current request is answered
     with ChunkPlayer(delayed, PlayerSettings(mode="async"), check=check) as player:
         see = lambda: Obs(state={"joints": np.array([position], np.float32)})  # noqa: E731
         player.reset(see(), "go")
@@ -130,7 +130,9 @@ def drive(
 
 
 def evaluated(agent: Agent, delta: bool, stall: int) -> Run:
-    """The same in a real-time evaluation, which asks when a part of the chunk is left."""
+    """Run the same in a real-time evaluation, which sends its next request when part of the chunk
+    is left.
+    """
     contract = Contract(action=ActionSpec(dim=1, delta=delta), control_hz=HZ)
     player = ChunkExecutor(ROWS - ANSWER, ClockConfig(latency=0.1, neutral=[0.0]), contract)
     at: list[float] = []
@@ -149,18 +151,17 @@ def evaluated(agent: Agent, delta: bool, stall: int) -> Run:
 
 
 def check_recovery(run: Run, stall: int) -> None:
-    wanted = GAIN * (GOAL - run.at)  # of the policy, where the robot is
+    wanted = GAIN * (GOAL - run.at)  # the policy's action at the robot's position
     still = np.abs(run.moved) < 1e-5
-    assert still.sum() >= stall - ROWS  # it did stall
-    # Not a tick's action is for another place than that at which the robot was: neither a jump, nor
-    # a part left out.
+    assert still.sum() >= stall - ROWS  # the robot did stall
+    # Each action belongs to the robot's position at that tick: no jump, and no part left out.
     assert run.moved[~still] == pytest.approx(wanted[~still], rel=1e-2)
     normal = np.abs(run.moved[: run.fresh - stall]).max()
     assert np.abs(run.moved[run.fresh :]).max() <= 1.5 * normal
     resumed = run.fresh + int(np.argmin(still[run.fresh :]))
     assert not still[resumed]
     assert (resumed - run.fresh) / HZ <= 0.5
-    assert still[resumed:].mean() < 0.1  # and continues moving
+    assert still[resumed:].mean() < 0.1  # and the robot continues to move
 
 
 @pytest.mark.parametrize("killed", [False, True])
@@ -170,7 +171,7 @@ def check_recovery(run: Run, stall: int) -> None:
 def test_after_a_stall_the_robot_goes_on_from_where_it_is(
     stall: int, *, delta: bool, guarded: bool, killed: bool
 ) -> None:
-    """Whether the policy answers late, or its replica was killed."""
+    """This holds if the policy answers late, and if its replica was killed."""
     agent: Agent = Approaching(delta)
     guard = Guard(agent.contract, max_step=1.5 * GAIN * GOAL) if guarded else None
     if not killed:

@@ -1,4 +1,6 @@
-"""What a client says of a URL with a wrong scheme, port or host, and how soon."""
+"""The client's errors for a URL with a wrong scheme, port or host, and the time until they are
+raised.
+"""
 
 from __future__ import annotations
 

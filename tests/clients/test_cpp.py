@@ -1,5 +1,5 @@
-"""The C++ client (clients/cpp) against a real server, the golden files, and servers that
-misbehave.
+"""The C++ client (clients/cpp) with a real server, the golden files, and servers that violate the
+protocol.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ Script = Callable[["Visit"], None]
 
 @dataclass
 class Visit:
-    """One WebSocket."""
+    """One WebSocket connection."""
 
     socket: ServerConnection
-    number: int  # number of the server's WebSockets, from 0
+    number: int  # number of the connection, from 0
     requests: list[Request] = field(default_factory=list)
 
     def request(self) -> Request:
-        """The next request; probes are left out."""
+        """Return the next request, without probes."""
         data = self.socket.recv()
         while bytes(data[:4]) == b"VLA?":  # type: ignore[arg-type]
             data = self.socket.recv()
@@ -82,17 +82,17 @@ class Visit:
         self.socket.send(answer(request, **more))
 
     def watch(self) -> None:
-        """Receive, and say nothing, until the client leaves."""
+        """Receive messages without answering until the client leaves."""
         for _ in self.socket:
             pass
 
     def raw(self, data: bytes) -> None:
-        """Bytes past the WebSocket."""
+        """Send bytes that bypass the WebSocket protocol."""
         self.socket.socket.sendall(data)
 
 
 def answer(request: Request, **more: Any) -> bytes:
-    """A reply: to an act the action [7], if `more` says nothing else."""
+    """Return a reply. The reply to an act has the action [7], unless `more` says otherwise."""
     what: dict[str, Any] = (
         {"act": Act(np.array([7.0], np.float32))} if request.op == "act" else {"info": {}}
     )
@@ -105,7 +105,7 @@ class ScriptedServer:
     metadata: dict[str, Any] = field(
         default_factory=lambda: {"protocol": PROTOCOL_VERSION, "policy": "scripted"}
     )
-    refuse: Response | None = None  # what each request gets
+    refuse: Response | None = None  # the response to each request, if set
     visits: list[Visit] = field(default_factory=list)
     # The header `authorization` of each request.
     keys: list[str | None] = field(default_factory=list)
@@ -116,7 +116,7 @@ class ScriptedServer:
 
 
 def document(status: int, content: dict[str, Any] | str, **headers: str) -> Response:
-    """A response with JSON, or with plain text."""
+    """Return a response with JSON or plain text."""
     kind = "text/plain" if isinstance(content, str) else "application/problem+json"
     body = content.encode() if isinstance(content, str) else json.dumps(content).encode()
     more = {name.replace("_", "-"): value for name, value in headers.items()}
@@ -126,7 +126,9 @@ def document(status: int, content: dict[str, Any] | str, **headers: str) -> Resp
 
 @contextmanager
 def scripted_server(script: Script) -> Iterator[ScriptedServer]:
-    """Run `script` for each WebSocket, in a thread; one that the client leaves ends quietly."""
+    """Run `script` in a thread for each WebSocket. The end of a connection by the client is not an
+    error.
+    """
     server = ScriptedServer()
 
     def process_request(_: ServerConnection, request: HttpRequest) -> Response | None:
@@ -171,8 +173,8 @@ FRAMES = [
 
 
 class Watcher(Agent):
-    """Answers with ROWS rows [value, row], and says what it saw; waits for its `gate` if told
-    so.
+    """A policy that returns ROWS rows [value, row] with the observed values in `info`, and waits
+    for its `gate` on request.
     """
 
     contract = Contract(action=ActionSpec(dim=2), chunk=ROWS, history=3)
@@ -220,7 +222,7 @@ class Replica:
     own: OwnPortServer
     known: ChangingKeys
     port: int
-    stream: dict[str, Any] | None  # what the metadata says of its own port
+    stream: dict[str, Any] | None  # the metadata of its own port
 
     @property
     def url(self) -> str:
@@ -229,7 +231,7 @@ class Replica:
 
 @contextmanager
 def replica(*, keyed: bool = False) -> Iterator[Replica]:
-    """A replica with its own port and the server's, without Ray."""
+    """Run a replica with its own port and the server's port, without Ray."""
     known, policy = ChangingKeys(), Watcher()
     engine = Engine(policy)
     check_key = (lambda token: known.keys.check(token, "app")) if keyed else NoKey.OPEN
@@ -303,7 +305,7 @@ def test_it_carries_the_reference_of_a_recurrent_policy(programs: Path) -> None:
 
 
 def plain(meaning: Any) -> Any:
-    """A meaning of the golden files as the driver prints the values of a frame."""
+    """Convert a meaning of the golden files into the driver's format."""
     if isinstance(meaning, list):
         return [plain(each) for each in meaning]
     if not isinstance(meaning, dict):
@@ -314,14 +316,14 @@ def plain(meaning: Any) -> Any:
         case "image" | "bytes":
             return {"bytes": list(base64.b64decode(meaning["base64"])), "subtype": None}
         case "float":
-            return None  # as nlohmann's writer has NaN and infinity
+            return None  # nlohmann's writer prints NaN and infinity like this
         case _:
             return {key: plain(value) for key, value in meaning.items()}
 
 
 def states(found: Any, meaning: Any) -> bool:
-    """Does a value of a frame say all that a meaning does? It may have further keys, and lack
-    what is a default.
+    """Return whether a value of a frame contains everything of a meaning. It may have further keys,
+    and lack defaults.
     """
     if isinstance(meaning, dict) and isinstance(found, dict):
         return all(states(found.get(key), value) for key, value in meaning.items())
@@ -358,7 +360,7 @@ def test_golden_frames_are_read_with_their_meaning(
 
 
 def observed(meaning: dict[str, Any]) -> dict[str, Any]:
-    """An observation of the golden files as the driver reads one."""
+    """Convert an observation of the golden files into the driver's format."""
     cameras = {
         name: {
             "pixels": bytes(image["values"]).hex(),
@@ -408,7 +410,7 @@ def test_garbage_is_refused_and_never_read_past_its_end(shared_driver: CppClient
         data = bytearray(frames[random.integers(len(frames))])
         for _ in range(random.integers(1, 4)):
             data[random.integers(len(data))] = random.integers(256)
-        with suppress(CppError):  # the driver still answers, whatever it was sent
+        with suppress(CppError):  # the driver still answers after any input
             shared_driver.call("reply", data=bytes(data[: random.integers(len(data) + 1)]).hex())
     deep = b'{"blobs":[],"info":' + b"[" * 100_000 + b"]" * 100_000 + b"}"
     framed = b"VLA\x01" + struct.pack("<I", len(deep)) + deep
@@ -537,7 +539,8 @@ def test_keys(programs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             client.reset()
             assert client.act(info={"value": 2})["values"][0] == 2
             server.known.change("arm", revoked=True)
-            wait_for(lambda: not server.engine.sessions)  # its connection was closed
+            # the server has noticed the end of its connection
+            wait_for(lambda: not server.engine.sessions)
             assert refused(client).code == "unauthorized"
 
 
@@ -545,8 +548,8 @@ def test_a_player_asks_for_the_next_chunk_in_time(server: Replica, programs: Pat
     with CppClient(programs, server.url, ahead=2) as player:
         player.reset()
         commands = [player.act(info={"value": tick}) for tick in range(10)]
-    # Each next chunk is asked for with two rows left, so its first two rows, which these replace,
-    # are left out.
+    # The next chunk is requested with two rows left. These two rows replace its first two rows,
+    # which are skipped.
     assert [command["action"] for command in commands] == [
         [0, 0], [0, 1], [0, 2], [0, 3], [2, 2], [2, 3], [4, 2], [4, 3], [6, 2], [6, 3],
     ]  # fmt: skip
@@ -579,7 +582,7 @@ def test_a_player_reports_its_ticks_to_the_server(server: Replica, programs: Pat
         for _ in range(ROWS):
             player.act()
         player.call("missed", ticks=ROWS)
-        player.act()  # it asks for the next chunk
+        player.act()  # this call requests the next chunk
         starved = {"ticks": 2 * ROWS + 1, "starved": ROWS, "share": (ROWS + 1) / (2 * ROWS + 1)}
         assert player.call("ticks") == pytest.approx(starved)
 
@@ -597,7 +600,7 @@ def test_a_player_throws_once_the_rows_are_executed(programs: Path) -> None:
         assert player.act()["row"] == 0
         assert player.act()["row"] == 1
         server.own.close()
-        assert player.act()["row"] == 2  # and asks for the next chunk
+        assert player.act()["row"] == 2  # this call also requests the next chunk
         assert player.act()["row"] == 3
         assert refused(player).code == "connection_lost"
 
@@ -614,7 +617,7 @@ def test_the_example_drives_a_robot(server: Replica, programs: Path) -> None:
     assert done.stderr == ""
 
 
-# Servers that misbehave
+# Servers that violate the protocol
 
 
 def obedient(visit: Visit) -> None:
@@ -677,11 +680,11 @@ def _header(length: int, first: int = 0x82) -> bytes:
     ("sent", "code"),
     [
         (_header(2**40), "too_large"),
-        (_header(100) + b"VLA\x01", "outcome_unknown"),  # and no more
+        (_header(100) + b"VLA\x01", "outcome_unknown"),  # no further bytes
         (b"\x82\x84\0\0\0\0VLA\x01", "malformed"),  # masked
         (b"\xc2\x04VLA\x01", "malformed"),  # compressed
         (b"\x81\x04text", "malformed"),
-        (b"\x80\x04VLA\x01", "malformed"),  # the rest of no message
+        (b"\x80\x04VLA\x01", "malformed"),  # a continuation without a message
         (b"\x89\x7e\x01\x00" + bytes(256), "malformed"),  # a ping that is too long
         (b"\x82\x05abcde", "malformed"),
         (b"\x88\x02\x03\xf0", "connection_lost"),  # closed with 1008
@@ -799,7 +802,7 @@ def test_a_lost_session_waits_for_a_server_that_comes_back(programs: Path) -> No
     with scripted_server(script) as server, CppClient(programs, server.url) as client:
         client.reset(info={"value": 1})
         client.begin("act", obs={"info": {"value": 2}})
-        while len(server.keys) < 4:  # metadata and WebSocket, then at least two refusals
+        while len(server.keys) < 4:  # metadata and WebSocket, then at least two rejections
             time.sleep(0.01)
         server.refuse = None
         assert client.result()["resumed"]

@@ -1,5 +1,5 @@
-"""The TypeScript client, by its own tests: golden files, a server that fails as told, and
-servers of this project.
+"""The TypeScript client, tested by its own tests with golden files, a server with controlled
+faults, and servers of this project.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def servers() -> Iterator[dict[str, str]]:
 
 
 def node(client: Path, *words: str, environment: dict[str, str] | None = None) -> str:
-    """What a script says; raises with all of it if it fails."""
+    """Run a script and return its output; raise an error with the whole output if it fails."""
     named = {name: value for name, value in os.environ.items() if name != "VLAGENTS_RAY_API_KEY"}
     done = subprocess.run(
         [str(typescript_client.NODE), *words],
@@ -50,7 +50,7 @@ def node(client: Path, *words: str, environment: dict[str, str] | None = None) -
 
 
 def passed(said: str) -> int:
-    """How many tests passed, of which none was left out."""
+    """Return the number of tests that passed; no test may be skipped."""
     counts = dict(
         line.removeprefix("# ").split(" ", 1) for line in said.splitlines() if line.startswith("# ")
     )

@@ -1,7 +1,8 @@
-"""cluster/docker: what the Dockerfile names is there, and nothing it should not have; each package
-by its digest.
+"""cluster/docker: the Dockerfile copies existing files and no forbidden ones, and installs each
+package by its digest.
 
-No container engine is needed. Locks get what pyproject.toml and the plug-ins' requirements/ want.
+No container engine is needed. The locks meet the requirements of pyproject.toml and of the
+plug-ins' requirements/.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ pytestmark = pytest.mark.integration
 
 @dataclass(frozen=True)
 class Instruction:
-    stage: str  # its name
-    word: str  # in capitals: RUN
+    stage: str  # the name of the stage
+    word: str  # the instruction in capitals: RUN
     flags: dict[str, str]  # --from=build: {"from": "build"}
-    text: str  # the rest, on one line
+    text: str  # the remaining text, on one line
 
 
 def instructions(file: Path) -> Iterator[Instruction]:
-    """In order, those before the first FROM in the stage ""; raises `ValueError` for a line that
-    is none.
+    """Yield the instructions of a Dockerfile in order. Those before the first FROM have the stage
+    "". Raise `ValueError` for an invalid line.
     """
     stage = ""
     kept = "\n".join(
@@ -49,7 +50,7 @@ def instructions(file: Path) -> Iterator[Instruction]:
             continue
         match = re.fullmatch(r"([A-Z]+)((?:\s+--[\w-]+=\S+)*)\s+(.*)", line)
         if match is None:
-            raise ValueError(f"{file}: {line!r} is no instruction")
+            raise ValueError(f"{file}: {line!r} is not an instruction")
         word, flags, text = match.groups()
         if word == "FROM":
             stage = text.rpartition(" AS ")[2]
@@ -64,7 +65,7 @@ STAGES = [line.stage for line in LINES if line.word == "FROM"]
 TARGETS = [
     line.stage for line in LINES if line.word == "LABEL" and line.stage != "system"
 ] + STAGES[-1:]
-LOCKS = {  # locks of the stages that install
+LOCKS = {  # locks of the stages that install packages
     line.stage: found[1]
     for line in LINES
     if (found := re.search(r"source=(\S+/locks/[^,]+)", line.flags.get("mount", "")))
@@ -80,7 +81,9 @@ def of(word: str, stage: str | None = None) -> list[str]:
 
 
 def copied() -> list[str]:
-    """What of the repository is copied into any stage, or mounted while a step runs."""
+    """Return the paths of the repository that are copied into any stage, or mounted during
+    a step.
+    """
     here = [
         line.text.split()[:-1] for line in LINES if line.word == "COPY" and "from" not in line.flags
     ]
@@ -176,7 +179,7 @@ def test_a_step_is_shell(run: str) -> None:
 
 
 def chain(target: str) -> list[str]:
-    """The stages that a target is made of, from the last to its base."""
+    """Return the stages of a target, from the last one to its base."""
     [base] = [text.partition(" AS ")[0] for text in of("FROM", target)]
     return [target, *(chain(base) if base in STAGES else [])]
 
@@ -213,7 +216,7 @@ def test_a_target_brings_its_own_packages_into_the_servers_environment_or_beside
 def test_what_runs_is_no_root_and_owns_nothing_but_where_it_writes(target: str) -> None:
     stages = [line for stage in reversed(chain(target)) for line in LINES if line.stage == stage]
     users = [i for i, line in enumerate(stages) if line.word == "USER"]
-    # Root installs a model's compiler, and no more.
+    # Only the installation of a model's compiler runs as root.
     assert [stages[i].text for i in users] == [
         "1000:1000",
         *(["0:0", "1000:1000"] if target in MODELS else []),
@@ -238,8 +241,8 @@ def test_models_alone_have_a_compiler(target: str) -> None:
 def test_triton_needs_the_headers_of_its_python(
     package: str, headers: bool, built: bool, tmp_path: Path
 ) -> None:
-    """install.sh runs with a uv that installs nothing, and a Python that names a folder of
-    headers.
+    """install.sh runs with a stand-in for uv that installs nothing, and with a Python that names a
+    folder of headers.
     """
     environment, include = tmp_path / "environment", tmp_path / "include"
     for folder in (include, environment / "bin", environment / "lib/python3.11/site-packages"):
@@ -320,15 +323,19 @@ ENTRY = re.compile(r"([a-z0-9-]+)==(\S+)((?: \\\n    --hash=sha256:[0-9a-f]{64})
 
 
 def locked(text: str) -> dict[str, str]:
-    """The versions by name, of a lock that consists of a comment and of packages with digests."""
+    """Return the versions in a lock by name. The lock consists of a comment and of packages with
+    digests.
+    """
     comment, _, entries = text.partition("\n")
     assert comment.startswith("# ")
-    assert ENTRY.sub("", entries) == "", "has a line that is neither a version nor a digest"
+    assert ENTRY.sub("", entries) == "", (
+        "the lock has a line that is neither a version nor a digest"
+    )
     return {name: version for name, version, _ in ENTRY.findall(entries)}
 
 
 def unmet(versions: dict[str, str], requirements: list[str]) -> list[str]:
-    """The requirements that no locked version meets."""
+    """Return the requirements that no locked version meets."""
     wanted = [Requirement(text) for text in requirements]
     torch = {one.name: one for one in map(Requirement, resolved.overrides(requirements))}
     wanted = [
@@ -362,8 +369,8 @@ def test_a_lock_meets_what_its_image_wants_and_has_a_digest_of_every_package(nam
 
 @pytest.mark.parametrize("name", resolved.locks())
 def test_a_lock_has_no_library_of_nvidia_twice(name: str) -> None:
-    """Those of two CUDAs overwrite each other: nvidia-cudnn-cu12 and -cu13 are unpacked into
-    nvidia/cudnn/lib.
+    """Libraries of two CUDA versions would overwrite each other: nvidia-cudnn-cu12 and -cu13 both
+    install into nvidia/cudnn/lib.
     """
     packages = [
         one

@@ -1,5 +1,5 @@
-"""What is lost when machines and networks of a cluster fail: time and attempts, no episode and
-no result.
+"""Failures of a cluster's machines and networks cost time and attempts, but no episode and no
+result.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from vlagents_ray.serve.ports import EVERYWHERE
 
 pytestmark = [pytest.mark.hosts, pytest.mark.slow]
 
-# What takes a process, or all results, to find out.
+# For conditions that need a process or all results to be checked.
 until = functools.partial(wait_for, timeout_s=300, every_s=0.25)
-POLICY = "policy"  # a resource of nodes that replicas may run on
-# Joined to the cluster before the command asks its policy, which is inside.
+POLICY = "policy"  # a resource of the nodes on which replicas may run
+# The program joins the cluster before the command connects to its policy, which is reachable only
+# inside.
 _SERVED = "import ray; ray.init(log_to_driver=False); from vlagents_ray.cli.main import app; app()"
 _OWN = """
 import sys, yaml
@@ -53,8 +54,8 @@ except VLAgentsError as error:
 def cluster_of(
     head: Host, nodes: Sequence[tuple[Host, int, bool]], run: Evaluation, **environment: str
 ) -> Iterator[RayCluster]:
-    """A head that runs nothing, and nodes with so many workers, and perhaps a replica; `run` is
-    to be run there.
+    """Run a head without workers, and nodes with a number of workers and possibly a replica; `run`
+    is the evaluation to run there.
     """
     shared = {"PYTHONPATH": PYTHONPATH, "TERM": "dumb", HURRY: str(run.hurry)} | environment
     with ray_cluster([head], cpus=0, environment=shared) as cluster:
@@ -65,7 +66,7 @@ def cluster_of(
 
 @contextlib.contextmanager
 def serving(head: Host, folder: Path, replicas: int) -> Iterator[str]:
-    """`Unhurried` for everybody who has the key that this yields."""
+    """Serve `Unhurried` on the cluster, and yield the key of its clients."""
     args = {
         "policy": "eval_fakes:Unhurried",
         "replicas": replicas,
@@ -102,10 +103,11 @@ def serving(head: Host, folder: Path, replicas: int) -> Iterator[str]:
 
 
 class Evaluation:
-    """One that runs at a host; `folder` has its results and its log.
+    """An evaluation on a host; `folder` contains its results and its log.
 
-    Its policy is `serving`'s if there is one, else each worker has its own. `episodes` are as many
-    as would take far longer than the test needs; the file `hurry` ends that.
+    With a server of `serving`, its policy is that server's; otherwise each worker has its own
+    policy. `episodes` is so large that the evaluation would take much longer than the test; the
+    file `hurry` makes the rest fast.
     """
 
     def __init__(self, folder: Path, episodes: int, workers: int) -> None:
@@ -126,7 +128,9 @@ class Evaluation:
 
     @contextlib.contextmanager
     def running(self, host: Host, *options: str, token: str | None = None) -> Iterator[None]:
-        """From its first episode on; `token` is the server's."""
+        """Run the evaluation during the context, which begins after its first episode; `token` is
+        the key of the server.
+        """
         command = [
             "env",
             f"{KEY_VARIABLE}={token}",
@@ -147,39 +151,41 @@ class Evaluation:
                 self._process.kill()
 
     def ends(self) -> int:
-        """The exit status."""
+        """Wait for the end, and return the exit status."""
         assert self._process is not None
         return self._process.wait(300)
 
     def plays(self, episodes: int) -> None:
-        """Wait for so many episodes in all."""
+        """Wait until `episodes` episodes are recorded."""
         process = self._process
         assert process is not None
         until(lambda: len(self.played()) >= episodes or process.poll() is not None)
         assert process.poll() is None, self.said()
 
     def goes_on(self, by: int = 12) -> None:
-        """Wait for some more episodes."""
+        """Wait for `by` more episodes."""
         self.plays(len(self.played()) + by)
 
     def played(self) -> list[EpisodeResult]:
-        """What is recorded so far."""
+        """Return the recorded episodes."""
         try:
             cases = Results.load(self.out).cases
-        except ConfigError:  # nothing yet
+        except ConfigError:  # no results have been written yet
             return []
         return [one.result for case in cases for one in case.episodes]
 
     def attempts(self) -> list[Attempt]:
-        """Those that infrastructure failed."""
+        """Return the attempts that failed for infrastructure errors."""
         return [one for case in Results.load(self.out).cases for one in case.attempts]
 
     def said(self) -> str:
-        """All that it printed."""
+        """Return the whole output."""
         return self._log.read_text()
 
     def is_whole(self, episodes: int) -> None:
-        """Each episode is there once, and as it comes out where nothing breaks."""
+        """Check that each episode exists once, with the same outcome as in a run without
+        failures.
+        """
         played = self.played()
         assert sorted(one.key.episode for one in played) == list(range(episodes))
         for one in played:
@@ -188,7 +194,7 @@ class Evaluation:
 
 
 def workers_on(host: Host) -> int:
-    """Processes of rollout workers there."""
+    """Return the number of rollout workers on a host."""
     return host.run(["ps", "-eo", "args"]).count("ray::Rollout")
 
 
@@ -197,7 +203,7 @@ MEMORY = Path("/proc/meminfo")
 
 @contextlib.contextmanager
 def cut_off(host: Host, seconds: float) -> Iterator[None]:
-    """A partition of that length, at least; the block runs meanwhile."""
+    """Cut a host off from the network for at least that time, while the block runs."""
     healed = time.monotonic() + seconds
     host.cut()
     yield
@@ -207,7 +213,7 @@ def cut_off(host: Host, seconds: float) -> Iterator[None]:
 
 @contextlib.contextmanager
 def out_of_memory(host: Host, folder: Path) -> Iterator[None]:
-    """As far as Ray's memory monitor there can see."""
+    """Simulate a host without free memory for Ray's memory monitor."""
     fake = folder / "meminfo"
     none = re.sub(
         r"(?m)^(MemFree|MemAvailable|Buffers|Cached|SReclaimable):.*",
@@ -221,7 +227,7 @@ def out_of_memory(host: Host, folder: Path) -> Iterator[None]:
 
 
 def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
-    """Two nodes with a replica and a worker each, and one with two workers."""
+    """Two nodes have a replica and a worker each, and one node has two workers."""
     episodes = 600
     run = Evaluation(tmp_path, episodes, workers=4)
     with hosts(5) as [head, one, two, simulating, spare]:
@@ -234,7 +240,7 @@ def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
             with cut_off(two, 3.0):
                 pass
             run.goes_on()
-            assert run.attempts() == [], "a short partition costs time alone"
+            assert run.attempts() == [], "a short partition must cost only time"
             with cut_off(two, 20.0):
                 run.goes_on()
             run.goes_on()
@@ -266,9 +272,9 @@ def test_a_robot_outside_of_the_cluster_keeps_its_loop_beside_an_evaluation(tmp_
         loop = ["--hz", "50", "--seconds", "20", "--transport", "websocket", "--safe", "hold"]
         code = "from vlagents_ray.cli import main; main()"
         command = [sys.executable, "-c", code, "robot", f"http://{head.name}:8000", *loop]
-        for attempt in (1, 2, 3):  # a machine that stands still for a second spoils one
+        for attempt in (1, 2, 3):  # a pause of the machine for a second can spoil an attempt
             try:
-                robot.run(command)  # it fails if a tick has no action of the policy
+                robot.run(command)  # fails if a tick has no action of the policy
             except HostFailed:
                 if attempt == 3:
                     raise
@@ -279,7 +285,7 @@ def test_a_robot_outside_of_the_cluster_keeps_its_loop_beside_an_evaluation(tmp_
 
 
 def test_memory_that_runs_out_costs_attempts_and_a_lost_head_a_resumption(tmp_path: Path) -> None:
-    """The driver runs at the node that is left, which then becomes the head of another cluster."""
+    """The driver runs on the remaining node, which then becomes the head of another cluster."""
     episodes = 400
     run = Evaluation(tmp_path, episodes, workers=2)
     with hosts(2) as [head, one]:

@@ -1,4 +1,4 @@
-"""Hosts on one machine: what they share, what not, that nothing of them is left, and Ray on
+"""Simulated hosts on one machine: shared and separate resources, complete removal, and Ray on
 several of them.
 """
 

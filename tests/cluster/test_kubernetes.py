@@ -1,5 +1,5 @@
-"""The manifests in cluster/kuberay: as the schemas want them, in step with each other, and a
-server that comes up.
+"""The manifests in cluster/kuberay: they are valid and consistent with each other, and their server
+starts.
 """
 
 from __future__ import annotations
@@ -50,8 +50,9 @@ PODS = {
     "evaluation-submitter": JOB.spec.submitter_pod_template,
     "reader": manifest("Pod", "results-reader"),
 }
-# Wanted of each container by https://kubernetes.io/docs/concepts/security/pod-security-standards/,
-# `restricted`, and a root that is read-only.
+# The requirements for each container in
+# https://kubernetes.io/docs/concepts/security/pod-security-standards/, `restricted`, and a
+# read-only root.
 CONTAINER = {
     "allowPrivilegeEscalation": False,
     "capabilities": {"drop": ["ALL"]},
@@ -83,7 +84,7 @@ with RemoteAgent(url, api_key=key) as agent:
 
 
 def values_of(document: Any, key: str) -> list[Any]:
-    """Of every `key` in a manifest, however deep."""
+    """Yield the values of every `key` in a manifest, at any depth."""
     if isinstance(document, list):
         return [value for one in document for value in values_of(one, key)]
     if not isinstance(document, dict):
@@ -128,7 +129,7 @@ def test_the_embedded_deployment_is_one_that_serve_takes(tmp_path: Path) -> None
         for port in SERVICE.cluster.head_group_spec.template["spec"]["containers"][0]["ports"]
         if port["name"] == "serve"
     ]
-    assert (config.http_options.host, config.http_options.port) == ("0.0.0.0", port)  # noqa: S104 - a pod's
+    assert (config.http_options.host, config.http_options.port) == ("0.0.0.0", port)  # noqa: S104 - an address in a pod
     [application] = config.applications
     args = ServerArgs(**application.args)
     assert args.autoscaling is not None
@@ -172,7 +173,7 @@ def test_pods_find_the_settings_that_a_server_of_our_own_gives_haproxy() -> None
 
 
 def complete(name: str) -> dict[str, Any]:
-    """The spec of a pod, with the container that KubeRay adds to a head."""
+    """Return the spec of a pod, including the container that KubeRay adds to a head."""
     spec = copy.deepcopy(PODS[name]["spec"])
     if name.endswith("-head"):
         cluster = (SERVICE if name.startswith("policy") else JOB).cluster
@@ -234,7 +235,7 @@ def test_a_pod_with_a_gpu_keeps_its_programs_for_the_next_one(name: str) -> None
         assert (mounts.get(cache) == "cache") is (
             "nvidia.com/gpu" in container["resources"]["limits"]
         )
-        # A mount below a volume would have parents that are root's.
+        # The parents of a mount below a volume would belong to root.
         assert not [path for path in mounts for other in mounts if path.startswith(f"{other}/")]
     assert manifest("PersistentVolumeClaim", "cache")["spec"]["accessModes"] == ["ReadWriteMany"]
 
@@ -253,7 +254,7 @@ def test_the_autoscaler_alone_may_ask_kubernetes(name: str) -> None:
 
 
 def labels_of(name: str) -> dict[str, str]:
-    """With the one that KubeRay adds."""
+    """Return the labels of a pod, including the one that KubeRay adds."""
     kind = (
         {"ray.io/node-type": "head" if name.endswith("-head") else "worker"}
         if name in RAY_PODS
@@ -263,7 +264,7 @@ def labels_of(name: str) -> dict[str, str]:
 
 
 def selected(selector: dict[str, Any]) -> set[str]:
-    """The pods that a selector of labels takes in."""
+    """Return the pods that a label selector matches."""
     return {
         name
         for name in PODS
@@ -284,26 +285,26 @@ def test_a_budget_keeps_the_heads_and_the_last_worker_that_serves() -> None:
         "policy-workers": {"policy-cpu", "policy-gpu"},
         "evaluation-head": {"evaluation-head"},
     }
-    # Of pods whose owner has no scale, Kubernetes takes a number alone.
+    # For pods whose owner has no scale, Kubernetes accepts only a number.
     for spec in budgets.values():
         assert spec["minAvailable"] == 1
         assert "maxUnavailable" not in spec
 
 
 def leaves(name: str) -> list[dict[str, Any]]:
-    """The rules of all policies by which a pod may connect to others."""
+    """Return the rules of all policies that allow a pod's outgoing connections."""
     policies = [one["spec"] for one in documents(FOLDER / "network.yaml")]
     mine = [
         spec
         for spec in policies
         if name in selected(spec["podSelector"]) and "Egress" in spec["policyTypes"]
     ]
-    assert mine, f"{name} reaches everything"
+    assert mine, f"{name} can reach everything"
     return [rule for spec in mine for rule in spec["egress"]]
 
 
 def reaches(name: str, address: str, port: int) -> bool:
-    """Whether a pod may connect to an address outside of the cluster's pods, by TCP."""
+    """Return whether a pod may connect over TCP to an address outside of the cluster's pods."""
     wanted = ipaddress.ip_address(address)
     for rule in leaves(name):
         blocks = [to["ipBlock"] for to in rule.get("to", []) if "ipBlock" in to]
@@ -324,7 +325,7 @@ def test_a_pod_reaches_its_own_names_and_public_weights_and_no_private_network(n
     assert reaches(name, "2600::1", 443)
     assert not reaches(name, "8.8.8.8", 80)
     for private in ("10.0.0.1", "172.16.0.1", "192.168.0.1", "169.254.169.254", "fd00::1"):
-        # Kubernetes' API, for the autoscaler.
+        # The autoscaler needs the Kubernetes API.
         assert reaches(name, private, 443) is name.endswith("-head"), private
         assert not reaches(name, private, 80), private
     to = [one for rule in leaves(name) for one in rule.get("to", [])]
@@ -382,7 +383,7 @@ def test_manifests_agree_on_names_versions_and_labels() -> None:
             "vlagents-ray/cluster": label
         }
     [backend] = values_of(manifest("Ingress", "policy"), "service")
-    assert backend["name"] == f"{SERVICE.metadata.name}-serve-svc"  # as KubeRay names it
+    assert backend["name"] == f"{SERVICE.metadata.name}-serve-svc"  # the name that KubeRay gives it
     claims = {
         one["metadata"]["name"] for one in everything if one["kind"] == "PersistentVolumeClaim"
     }
@@ -443,7 +444,7 @@ def test_the_manifests_server_comes_up_and_robots_with_a_key_play(tmp_path: Path
             "import sys, urllib.request as u; print(u.urlopen(sys.argv[1], "
             "timeout=5).read().decode())"
         )
-        # what KubeRay asks, and what nobody is told without a key
+        # KubeRay's health check, which gets no answer without a key
         assert "success" in head.run(
             [sys.executable, "-c", health, "http://localhost:8000/-/healthz"]
         )

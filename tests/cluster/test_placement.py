@@ -1,5 +1,5 @@
-"""Who runs where, and by which transport: a real Ray cluster of three nodes, and a robot on a
-host outside it.
+"""The placement of processes and their transports, on a real Ray cluster of three nodes, with a
+robot on a host outside it.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from benchmarks.hosts import Host, RayCluster, hosts, ray_cluster
 pytestmark = pytest.mark.hosts
 
 PLACED = [sys.executable, "-m", "placement_commands"]
-CPUS = 2  # cpus of each node, each of which has room for as many workers
+CPUS = 2  # CPUs of each node, which therefore has room for two workers
 STORE = {"object_store_memory": "200000000"}
 
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """Application "one" has its replica on host2, "two" one each on host2 and host3."""
+    """A server whose application "one" has a replica on host2, and "two" has replicas on host2 and
+    host3.
+    """
 
     cluster: RayCluster
     robot: Host
@@ -33,7 +35,7 @@ class Served:
     def play(
         self, app: str, workers: int, out: Path, transport: str = "auto"
     ) -> Counter[tuple[str, str]]:
-        """How many of an evaluation's workers ran where, and had which transport."""
+        """Run an evaluation, and return the number of its workers by host and transport."""
         said = self.cluster.head.run([*PLACED, "play", app, str(workers), transport, str(out)])
         found = json.loads(said.splitlines()[-1])
         assert found["episodes"] == 2 * workers
@@ -76,7 +78,7 @@ def test_workers_are_shared_over_the_nodes_of_several_replicas(
     served: Served, tmp_path: Path
 ) -> None:
     wanted = {("host2", "shm"): 2, ("host3", "shm"): 2}
-    # A replica that stands still for 0.3 s is not offered to a worker on its node.
+    # A replica that pauses for 0.3 s is not offered to a worker on its node.
     for attempt in ("1", "2", "3"):
         found = served.play("two", 4, tmp_path / attempt)
         if found == wanted:

@@ -1,4 +1,4 @@
-"""docs/cluster/index.md, run as it is written on three hosts; and the files in cluster/ray."""
+"""docs/cluster/index.md runs as written on three hosts; and the files in cluster/ray work."""
 
 from __future__ import annotations
 
@@ -31,12 +31,14 @@ HAPROXY = "RAY_SERVE_HAPROXY_BINARY_PATH"
 
 
 def said_of(where: str) -> list[Block]:
-    """The page's blocks that say of themselves that they run there."""
+    """Return the page's blocks that are marked to run at that place."""
     return [block for block in PAGE if (block.not_run or "").startswith(where)]
 
 
 class Machines:
-    """The page's machines, on hosts: each with a home of its own, and in the same checkout."""
+    """The page's machines as simulated hosts, each with its own home folder and the same
+    checkout.
+    """
 
     def __init__(self, first: Host, second: Host, robot: Host, checkout: Path) -> None:
         self.first, self.second, self.robot, self.checkout = first, second, robot, checkout
@@ -64,8 +66,8 @@ class Machines:
 
     @contextmanager
     def serving(self, block: Block, log: Path) -> Iterator[None]:
-        """While this lasts, the block runs on the first machine, and has said that it serves; it
-        ends by Ctrl-C.
+        """Run the block on the first machine during the context, from the time when it serves; end
+        it with Ctrl-C.
         """
         number = self.checkout / "server.pid"
         command = self.command(block)
@@ -90,7 +92,7 @@ class Machines:
             except subprocess.TimeoutExpired:
                 server.kill()
                 server.wait()
-                pytest.fail(f"serve has not ended: {log.read_text()}")
+                pytest.fail(f"serve did not end: {log.read_text()}")
 
 
 @pytest.mark.hosts
@@ -111,7 +113,7 @@ def test_the_page_makes_a_cluster_that_serves_a_robot_and_evaluates(tmp_path: Pa
         (machines.home(second) / ".ray").mkdir()
         shutil.copy(token, machines.home(second) / ".ray")
         machines.run(second, join)
-        # Ray says so every few seconds.
+        # Ray prints the status every few seconds.
         wait_for(lambda: machines.run(first, status).count("node_") == 2)
 
         machines.run(first, keys)
@@ -158,7 +160,9 @@ def test_the_settings_for_ray_start_are_those_of_a_server_of_our_own() -> None:
 
 
 def haproxy_files(home: Path, times: int = 1) -> dict[str, Path]:
-    """Where HAProxy's files are by the script, if /tmp is `home` and it is read so often."""
+    """Return the paths of HAProxy's files that the script sets, with /tmp replaced by `home`, after
+    the script was sourced `times` times.
+    """
     script = home / "environment.sh"
     script.write_text(SCRIPT.read_text().replace("/tmp/", f"{home}/"))
     environment = {"PATH": ENV["PATH"], "PYTHONPATH": str(ROOT)}
@@ -176,13 +180,16 @@ def haproxy_files(home: Path, times: int = 1) -> dict[str, Path]:
 
 @pytest.mark.slow
 def test_no_other_user_reaches_the_socket_that_commands_haproxy(tmp_path: Path) -> None:
-    """Not in a folder that somebody has made before, nor through a link."""
+    """The files are neither in a folder that another user has created before, nor reachable through
+    a link.
+    """
     own = ingress_environment(tmp_path, "/bin/true")
     wanted = {name for name, value in own.items() if value.startswith(str(tmp_path))}
     (tmp_path / "no-replica.http").unlink()
-    files = haproxy_files(tmp_path, times=2)  # as the page does
+    files = haproxy_files(tmp_path, times=2)  # like on the page
     assert set(files) == wanted
-    assert str(haproxy_binary()) in files[HAPROXY].read_text()  # not itself
+    # HAProxy's binary is called, not the launcher itself
+    assert str(haproxy_binary()) in files[HAPROXY].read_text()
     folder = tmp_path / f"vlr-haproxy-{os.getuid()}"
     assert {path if path == folder else path.parent for path in files.values()} == {folder}
     assert folder.stat().st_mode & 0o777 == 0o700

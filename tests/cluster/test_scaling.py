@@ -1,4 +1,4 @@
-"""More workers play more, on several nodes; and several drivers share a cluster."""
+"""More workers on several nodes run more episodes, and several drivers share a cluster."""
 
 from __future__ import annotations
 
@@ -40,34 +40,37 @@ evaluate(EvalConfig(
 
 @pytest.mark.alone
 def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> None:
-    """Anything that all wait for would halve it; the bound leaves room for a machine that has
-    other work to do.
+    """A common bottleneck would halve the rate. The bound leaves room for other work of the
+    machine.
     """
     plan = ScalingPlan(workers=(1, 4), rounds=1, steps=20, seconds=3.0)
     with driving(plan, nodes=2) as (driver, size, made):
         assert size == 2
-        for _ in range(3):  # a machine that stands still for a second spoils a round
+        for _ in range(3):  # a pause of the machine for a second would spoil a round
             rows = {
                 (row["app"], row["workers"]): row
                 for row in measure_cluster(plan, size, driver, made=made)["rows"]
             }
             if rows[OWN, 4]["of_linear"] > 0.6:
                 break
-        # Over before the last worker is there, as with the rounds that tell the driver's costs.
+        # These episodes are over before the last worker is ready, like in rounds that measure the
+        # driver's costs.
         short = PlayedEpisodes(
             **driver.request(
                 json.dumps(asdict(ScalingRound(4, episodes=2, steps=1, step_ms=1.0, size=32))),
                 120.0,
             )
         )
-    assert (short.episodes, short.episodes_per_minute) == (7, None), "after the first"
+    assert (short.episodes, short.episodes_per_minute) == (7, None), (
+        "episodes after the first worker's start"
+    )
     own = rows[OWN, 4]
     assert own["of_linear"] > 0.6
     assert own["of_ideal"] <= 1.01
     assert own["failures"] == 0
-    assert own["transports"] == ["shm"], "a replica for each worker of a node is on that node"
+    assert own["transports"] == ["shm"], "the replica of each worker must be on the worker's node"
     assert own["near"] == 1
-    assert own["sent_bytes_per_act"] < IMAGE_BYTES / 10, "no image leaves its host"
+    assert own["sent_bytes_per_act"] < IMAGE_BYTES / 10, "no image must leave its host"
 
 
 def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merged(
@@ -101,4 +104,4 @@ def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merge
     ]
     assert [one.result.status for one in merged.cases[0].episodes] == ["done"] * 12
     first, second = sorted(merged.runs, key=lambda run: run.started)
-    assert second.started < (first.ended or 0), "they were there at the same time"
+    assert second.started < (first.ended or 0), "both drivers must run at the same time"

@@ -1,5 +1,5 @@
-"""Abilities: an agent has those whose protocols it implements, and a wrapper has those of its
-policy, without naming them.
+"""Abilities: an agent has the abilities whose protocols it implements, and a wrapper has those of
+its policy, without listing them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from vlagents_ray.testing import check_agent
 
 
 class Dances(Protocol):
-    """An ability that only this test knows."""
+    """An ability that only this test defines."""
 
     tempo: float
 
@@ -46,15 +46,15 @@ class Dances(Protocol):
 
 
 class Rehearses(Speculative, Protocol):
-    """Another one, which is called on an observation before its turn."""
+    """Another such ability, which is called on an observation before its turn."""
 
     def rehearse(self, obs: Obs) -> str:
         """Rehearse an observation."""
 
 
 def protocols_of(module: Any) -> list[type]:
-    """The protocols of abilities in a module. Marks have no members, and `Forwards` is how an agent
-    passes abilities on.
+    """Return the protocols of abilities in a module. Marker classes have no members, and `Forwards`
+    is the mechanism that passes abilities on.
     """
     found = []
     for value in vars(module).values():
@@ -83,7 +83,9 @@ class Same(Wrapper):
 
 
 class Counted(Wrapper):
-    """A wrapper that changes observations, and counts those of its session, like a tracker."""
+    """A wrapper that changes observations, and counts the observations of its session, like a
+    tracker.
+    """
 
     def __init__(self, agent: Agent) -> None:
         super().__init__(agent)
@@ -100,7 +102,7 @@ class Counted(Wrapper):
 
 
 class Brightened(Wrapper):
-    """A wrapper that changes an observation in the same way however often it is called."""
+    """A wrapper that always changes an observation in the same way."""
 
     repeatable = True
 
@@ -111,7 +113,7 @@ class Brightened(Wrapper):
 
 
 AROUND: dict[str, tuple[Callable[[Agent], Agent], int, bool]] = {
-    # The number of changes of an observation, and whether it may be changed twice.
+    # The number of changes of an observation, and whether the change may be repeated.
     "alone": (lambda agent: agent, 0, True),
     "wrapped": (Same, 0, True),
     "wrapped twice": (lambda agent: Same(Same(agent)), 0, True),
@@ -124,7 +126,7 @@ AROUND: dict[str, tuple[Callable[[Agent], Agent], int, bool]] = {
 
 
 def policy_with(protocol: type, calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]]) -> Agent:
-    """A policy with an ability, whose methods record their arguments."""
+    """Return a policy with an ability, whose methods record their arguments."""
 
     def recording(name: str) -> Callable[..., Any]:
         def method(self: Agent, *args: Any, **kwargs: Any) -> str:
@@ -255,7 +257,7 @@ def test_an_agent_that_names_its_parameters_is_trainable() -> None:
 
 
 class Preparing(Plain):
-    """A policy that acts on what it has prepared, if it has."""
+    """A policy that acts on its prepared value if there is one."""
 
     def prepare(self, obs: Obs) -> Any:
         return np.float32(obs.gripper or 0.0)
@@ -273,7 +275,7 @@ def test_the_policy_gets_what_was_prepared_through_its_wrapper() -> None:
     obs.prepared = prepares.prepare(obs)
     assert obs.prepared == 1.25
 
-    obs.prepared = np.float32(7)  # by which it is known that the policy does not prepare again
+    obs.prepared = np.float32(7)  # this value shows that the policy does not prepare again
     assert wrapper.act(obs).action.tolist() == [7]
     check_agent(Brightened(Preparing()), obs=[Obs(gripper=value) for value in (0.1, 0.2, 0.3)])
 

@@ -35,14 +35,14 @@ GOAL = np.array([1.0, -2.0, 0.5], np.float32)
 HORIZON, TICKS = 12, 40
 ARM = Contract(
     cameras={"front": CameraSpec(32, 32)},
-    state={"joints": StateSpec(3), "arm": StateSpec(2)},  # the arm alone, without its gripper
+    state={"joints": StateSpec(3), "arm": StateSpec(2)},  # the arm without its gripper
     action=ActionSpec(dim=3, delta=False),
 )
 
 
 class Reaching(Agent):
-    """Takes two fifths of the way at each row, from the measured pose or from the rows that it
-    is given.
+    """A policy whose rows each move two fifths of the remaining way, from the measured pose or from
+    the given rows.
     """
 
     shared = ("gate",)
@@ -62,7 +62,7 @@ class Reaching(Agent):
 
     def act(self, obs: Obs) -> Act:
         self.acts += 1
-        if self.gated and self.acts > 1:  # the first is what `reset` waits for
+        if self.gated and self.acts > 1:  # `reset` waits for the first answer
             assert self.gate.acquire(timeout=30)
         pose = obs.state["joints"]
         origin = (
@@ -88,7 +88,7 @@ def absolute(agent: Agent, **settings: Any) -> AbsoluteActions:
 
 
 def poses(inner: Reaching, agent: Agent, ticks_late: int, **settings: Any) -> np.ndarray:
-    """The joints at each tick, (TICKS, 3) rad, where each answer comes `ticks_late` ticks after
+    """Return the joints at each tick, (TICKS, 3) rad. Each answer arrives `ticks_late` ticks after
     the last one.
     """
     robot, found = SimulatedRobot(ARM), []
@@ -134,7 +134,7 @@ def test_relative_actions_move_the_arm_as_absolute_ones_do(
         poses(relative, absolute(relative), ticks_late, **settings), wanted, atol=1e-5
     )
     assert own.acts == relative.acts
-    assert np.abs(wanted[-1] - GOAL).max() < 0.1  # it arrives
+    assert np.abs(wanted[-1] - GOAL).max() < 0.1  # the arm reaches its goal
 
 
 def test_a_plan_comes_back_as_it_was_given_from_another_pose() -> None:

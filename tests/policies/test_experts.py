@@ -1,5 +1,5 @@
-"""The experts of ManiSkill's tasks: those that are installed here are solved, and what an expert
-lacks is named.
+"""The experts of ManiSkill's tasks: they solve the installed tasks, and a missing requirement of an
+expert is named.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CUBES = ("PushCube-v1", "PickCube-v1")
 @pytest.mark.parametrize("task", CUBES)
 def test_the_expert_solves_the_task_and_the_cube_stays(task: str) -> None:
     name = f"maniskill/{task}"
-    with ManiSkill(task, width=16, height=16) as env:  # experts do not look at the image
+    with ManiSkill(task, width=16, height=16) as env:  # experts do not use the image
         for seed in range(EPISODES):
             obs, _ = env.reset(seed=seed)
             expert = expert_class(name)(name)
@@ -33,13 +33,13 @@ def test_the_expert_solves_the_task_and_the_cube_stays(task: str) -> None:
                 obs, _, terminated, truncated, info = env.step(expert.act(obs))
                 successes.append(info["success"])
                 assert not terminated
-            assert len(successes) == env.max_steps == 50  # the env continues after success
+            assert len(successes) == env.max_steps == 50  # the environment continues after success
             assert successes[-1], f"seed {seed}"
 
 
 def test_a_stuck_arm_gets_shorter_commands() -> None:
-    """ManiSkill's inverse kinematics fails for some long steps, and the arm then stays where it
-    is.
+    """ManiSkill's inverse kinematics fails for some long steps, after which the arm does
+    not move.
     """
     expert = expert_class("maniskill/PushCube-v1")("maniskill/PushCube-v1")
     state = np.zeros(35, np.float32)

@@ -1,5 +1,5 @@
-"""The random steps of flow matching: their distribution, their log-probability, and whose noise
-they take.
+"""The random steps of flow matching: their distribution, their log-probability, and the source of
+their noise.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from vlagents_ray.policies.flow import (
 )
 
 torch = pytest.importorskip("torch")
-torch.set_num_threads(1)  # tensors this small are faster in one
+torch.set_num_threads(1)  # such small tensors are faster with one thread
 pytestmark = pytest.mark.torch
 
 STEPS, HORIZON, DIM, LEVEL = 5, 4, 3, 0.7
@@ -31,7 +31,7 @@ SHAPE = (STEPS, HORIZON, DIM)
 
 
 def velocity(actions: Any, time: float) -> Any:
-    """Some flow, in which each number depends on all of its chunk."""
+    """Return the velocity of a flow in which each number depends on the whole chunk."""
     return 0.3 * actions + 0.1 * actions.sum((1, 2), keepdim=True) - time
 
 
@@ -40,7 +40,7 @@ def row(seed: int, *want: str) -> Row:
 
 
 def followed(rows: list[Row], level: float = LEVEL) -> tuple[Any, RandomSteps | None]:
-    """The actions of rows, and their random steps."""
+    """Return the actions of rows, and their random steps."""
     actions = torch.from_numpy(np.stack([one.noise(HORIZON, DIM) for one in rows]))
     random = RandomSteps.for_rows(rows, SHAPE, level, torch.from_numpy)
     actions = follow(velocity, actions, STEPS, *([] if random is None else [random.change]))
@@ -59,8 +59,8 @@ def test_random_steps_lead_to_the_distribution_of_the_flow(level: float) -> None
     x = np.random.default_rng(0).standard_normal(20_000)
     for step in range(steps):
         time = 1.0 - step / steps
-        # of normal data: the expected noise minus the expected action, given x = time * noise + (1
-        # - time) * action
+        # For normal data: the expected noise minus the expected action, given x = time * noise + (1
+        # - time) * action.
         gain = (x - (1 - time) * mean) / (time**2 + ((1 - time) * std) ** 2)
         change = time * gain - (mean + (1 - time) * std**2 * gain)
         drawn = np.random.default_rng([1, step]).standard_normal(len(x))
@@ -143,8 +143,8 @@ def test_only_what_is_wanted_is_stated() -> None:
 
 
 def test_no_statement_imports_from_the_lazy_module() -> None:
-    """`torch.compile` of torch 2.11 follows no import from `transformers` itself; `require` is
-    for code around it.
+    """`torch.compile` of torch 2.11 cannot trace an import from `transformers` itself; `require` is
+    for the code around it.
     """
     package = Path(flow.__file__).parent
     assert not [

@@ -1,4 +1,6 @@
-"""The policies that do nothing, in an adjustable time, or act at random by their seeds."""
+"""The policies that do nothing for an adjustable time, or return random actions from their
+seeds.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from vlagents_ray.testing import check_agent
 
 
 def batch_seconds(agent: Noop, size: int) -> float:
-    """The shortest of three batches: other work on the machine only ever adds."""
+    """Return the shortest duration of three batches, since other work on the machine only adds
+    time.
+    """
     times = []
     for _ in range(3):
         begin = time.perf_counter()

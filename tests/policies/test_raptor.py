@@ -95,7 +95,7 @@ def test_a_session_of_a_killed_replica_says_so_and_acts_as_before(
 
 
 def test_the_observations_that_a_client_keeps_stand_for_the_whole_flight(policy: Raptor) -> None:
-    """Of `history` observations the last one has no answer yet."""
+    """The last observation in `history` has no answer yet."""
     flights, seen = 100, []
     whole, batch = together(policy, flights), HoverBatch(flights)
     obs = batch.reset(seeds=range(flights))
@@ -125,7 +125,7 @@ def test_a_session_that_must_not_be_resumed_gets_an_error(replicas: Replicas) ->
 
 
 def test_nine_of_ten_quadrotors_come_to_the_target_and_hover(policy: Raptor) -> None:
-    """Of 500, of which none is like another: 92 %, with a 95 % interval from 89 to 94."""
+    """92 % of 500 different quadrotors, with a 95 % interval from 89 to 94 %."""
     batch, acts = HoverBatch(500), together(policy, 500)
     obs = batch.reset(seeds=range(500))
     flying, hovered = np.ones(500, bool), np.zeros(500, bool)
@@ -135,7 +135,7 @@ def test_nine_of_ten_quadrotors_come_to_the_target_and_hover(policy: Raptor) -> 
         hovered |= flying & [info["success"] for info in infos]
         flying &= ~np.array(crashed)
     assert 0.89 <= hovered.mean() <= 0.94
-    # Other processors round otherwise.
+    # Other processors round differently.
     assert abs(hovered.sum() - RATES["RAPTOR"]["successes"]) <= 2
     assert RATES["RAPTOR"]["episodes"] == 500
 
@@ -157,8 +157,8 @@ def test_a_crashed_quadrotor_stays_where_it_is_while_the_others_fly_on() -> None
 
 
 def test_a_quadrotor_obeys_gravity_and_thrust() -> None:
-    """Without thrust a quadrotor falls as a stone does; level and with the thrust of its weight
-    it stays.
+    """Without thrust a quadrotor falls freely; level, and with the thrust of its weight, it
+    hovers.
     """
     flights = Quadrotors([0, 1, 2])
     body = flights.parameters

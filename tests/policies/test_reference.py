@@ -1,4 +1,4 @@
-"""The reference policy with random weights: what holds whatever it has learnt."""
+"""The reference policy with random weights: properties that do not depend on its training."""
 
 from __future__ import annotations
 
@@ -58,7 +58,8 @@ ROBOTS = {
 }
 ALL = ["logprob", "entropy", "replay"]
 LEVEL = 0.5
-BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
+# largest difference between the actions of a batch and of a single row, in float32 on a CPU
+BATCHED = 1e-5
 SUMMED = 2e-3  # largest error of a sum of 5 log-probabilities, in float32
 
 
@@ -236,7 +237,7 @@ def test_compiled_in_bfloat16_and_with_pushed_weights_it_stays_itself(
     views = [seen(i) for i in range(3)]
     with counting_compiler() as compiler:
         compiled = made(folder, compile="require", batch_sizes=[3])
-        assert compiler.rows == [3, 3]  # what is seen, and one step of the flow
+        assert compiler.rows == [3, 3]  # the encoder and one step of the flow
         np.testing.assert_allclose(acted(compiled, views), acted(loaded, views), atol=BATCHED)
         assert compiler.calls > 0
     np.testing.assert_allclose(

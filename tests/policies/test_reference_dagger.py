@@ -1,6 +1,4 @@
-"""DAgger with the reference policy: corrections that an expert shows, and training on these
-alone.
-"""
+"""DAgger with the reference policy: an expert's corrections, and training on these alone."""
 
 from __future__ import annotations
 

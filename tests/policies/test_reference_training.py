@@ -1,5 +1,5 @@
-"""The training of the reference policy, from demonstrations that are recorded and exported by
-the usual commands.
+"""The training of the reference policy, from demonstrations that the usual commands record and
+export.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""The weights of the reference policy that this repository has: they succeed as its card says."""
+"""The weights of the reference policy in this repository: their success rates match the
+model card.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 CHECKPOINT = ROOT / "examples/reference/checkpoint"
 RATES = json.loads((CHECKPOINT / "rates.json").read_text())
 EPISODES = 20
-AT_ONCE = 10  # a batch of ten takes hardly longer than one of one
+AT_ONCE = 10  # a batch of ten takes hardly longer than a batch of one
 TASKS = [env for env, (solved, episodes) in RATES["tabletop"].items() if solved / episodes > 0.8]
 
 
@@ -36,8 +38,8 @@ def test_they_are_small_enough_for_a_repository() -> None:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """Lets torch compute with one thread: its batches are too small to share, and other tests run
-    beside.
+    """Let torch use one thread, since its batches are too small to share, and other tests run at
+    the same time.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -50,7 +52,7 @@ def one_thread() -> Iterator[None]:
 def test_they_succeed_as_often_as_their_card_says(env: str, tmp_path: Path) -> None:
     solved, episodes = RATES["tabletop"][env]
     options: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
-    # Seeds of no evaluation.
+    # No evaluation uses these seeds.
     suite = SuiteConfig(
         envs=[env], env_options=options, episodes=EPISODES, seeds=[10_000], num_envs=AT_ONCE
     )
@@ -66,7 +68,7 @@ def test_they_succeed_as_often_as_their_card_says(env: str, tmp_path: Path) -> N
     found = evaluate(plan, agent_factory=lambda: LocalPolicy(args, config)).total
     assert (
         found.success_once.successes / EPISODES >= wilson(solved, episodes)[0] - 0.15
-    )  # 30 episodes: a deviation of 0.05
+    )  # 30 episodes, with a standard deviation of 0.05
     [case] = Results.load(tmp_path).cases
     assert len({one.actions_sha256 for one in case.counted}) == EPISODES
 

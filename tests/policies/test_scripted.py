@@ -1,4 +1,4 @@
-"""One policy, an expert for each env."""
+"""One policy that runs the expert of each environment."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_it_looks_again_and_succeeds_when_the_puck_was_moved_away_under_it() -> 
         agent.reset(obs, env.instruction, env="tabletop/lift")
         assert env._world is not None
         puck = env._world.puck(colour)
-        puck.x, puck.y = 0.26, -0.19  # a corner where nothing lies
+        puck.x, puck.y = 0.26, -0.19  # an empty corner
         success = truncated = False
         while not truncated and not success:
             obs, _, _, truncated, info = env.step(agent.act(obs))

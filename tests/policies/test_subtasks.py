@@ -16,7 +16,7 @@ from vlagents_ray.testing import check_agent
 
 
 class Obedient(Agent):
-    """Answers with the instruction of its last reset, and how often it has acted since."""
+    """A policy that returns the instruction of its last reset, and the number of acts since."""
 
     contract = Contract(action=ActionSpec(dim=1))
 

@@ -1,4 +1,6 @@
-"""Wrappers: a policy sees changed observations, in any session, through any of its calls."""
+"""Wrappers: a policy receives changed observations, in each session and through each of its
+calls.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ from vlagents_ray.testing import check_agent
 
 
 class Bright(Agent):
-    """Answers how bright its camera is, and how many of its session's observations it has seen."""
+    """A policy that returns the brightness of its camera, and the number of its session's
+    observations.
+    """
 
     shared = ("weights",)
 
@@ -59,7 +63,9 @@ class DimConfig(BaseModel, extra="forbid"):
 
 
 class Dim(Wrapper):
-    """Takes `by` off each pixel, and one more with each observation of the session."""
+    """A wrapper that subtracts `by` from each pixel, and one more with each observation of the
+    session.
+    """
 
     Config = DimConfig
 

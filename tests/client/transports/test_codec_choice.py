@@ -1,5 +1,5 @@
-"""The codec of the cameras depends on where the server is, not on what a link carries at the
-moment.
+"""The codec of camera images depends on the location of the server, not on the link's
+current load.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ SERVER = Path(__file__).parents[2] / "support/noop_http_server.py"
 
 @contextmanager
 def another_network() -> Iterator[str]:
-    """The URL of a server in a network namespace, at the other end of a pair of links."""
+    """Yield the URL of a server in another network namespace, at the other end of a pair of
+    links.
+    """
     if os.geteuid() != 0 or not shutil.which("ip"):
         pytest.skip("a network namespace needs root and ip (Debian: iproute2)")
 
@@ -40,7 +42,7 @@ def another_network() -> Iterator[str]:
 
     number = os.getpid() % 2**14
     space, ours, theirs = f"vlr{number}", f"vlrh{number}", f"vlrn{number}"
-    # RFC 2544's, for tests of links.
+    # Addresses that RFC 2544 reserves for tests of links.
     host, peer = (f"198.18.{number // 64}.{number % 64 * 4 + end}" for end in (1, 2))
     inside = ["netns", "exec", space]
     with ExitStack() as stack:
@@ -63,7 +65,7 @@ def test_pixels_are_raw_within_a_machine_and_compressed_over_a_network(
 ) -> None:
     choice = CodecChoice(requested)
     assert choice.codec is None
-    # Each connection decides again.
+    # Each connection chooses again.
     for near, chosen in ((True, RAW), (False, compressed), (True, RAW)):
         choice.connected(near=near)
         assert choice.codec == choice.codec_for(OBS) == chosen

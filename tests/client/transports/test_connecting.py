@@ -1,4 +1,4 @@
-"""Connecting while a replica hangs, and while there is no server yet."""
+"""Connecting while a replica hangs, and while no server is running."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ TIMEOUT_S = 2.0  # timeout of an act, in which a session whose replica froze con
 
 
 class Clock(SimulatedTime):
-    """Time that passes while the first replicas that are asked do not answer."""
+    """A clock that advances while the first replicas that a client tries do not answer."""
 
     def __init__(self, hanging: int = 1) -> None:
         self.hanging = hanging
-        self.waited: list[float] = []  # s, for each that was asked
+        self.waited: list[float] = []  # timeout of each attempt, s
 
     def ask(self, timeout_s: float, error: Exception) -> None:
         self.waited.append(timeout_s)
@@ -74,14 +74,16 @@ def by_the_handle(clock: Clock, timeout_s: float, monkeypatch: pytest.MonkeyPatc
 def test_what_connects_has_time_left_when_the_first_replicas_hang(
     connect: Callable[[Clock, float, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All of it went to the replica that was chosen first, which might be the frozen one again."""
+    """In an earlier version, the replica that was tried first used up all of the time, and it might
+    be the frozen one again.
+    """
     act, reset = Clock(), Clock(hanging=2)
     for clock, timeout_s in ((act, TIMEOUT_S), (reset, 60.0)):
         for module in (http, websocket, serve_handle):
             monkeypatch.setattr(module, "time", clock)
         connect(clock, timeout_s, monkeypatch)
     assert len(act.waited) == 2
-    assert act.now <= TIMEOUT_S / 2, "less than half is left for the act"
+    assert act.now <= TIMEOUT_S / 2, "less than half of the time is left for the act"
     first = first_timeout_s(60)
     assert reset.waited == [first, 2 * first, 4 * first]
     never = Clock(hanging=99)
@@ -113,7 +115,9 @@ def test_a_server_that_is_waited_for_is_reported_once_within_seconds(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """A wrong URL was silent for a minute; a server that restarts within a second is no news."""
+    """In an earlier version, a wrong URL caused no message for a minute. A server that restarts
+    within a second needs no message.
+    """
     clock = Clock()
     reported_at: list[float] = []
 
@@ -139,9 +143,7 @@ def test_a_server_that_is_waited_for_is_reported_once_within_seconds(
 def test_a_server_that_refuses_connections_is_one_without_replicas(
     kind: type[HttpTransport | WebSocketTransport],
 ) -> None:
-    """So that a reset waits for HAProxy as it waits for a replica; both start again within
-    seconds.
-    """
+    """So a reset waits for HAProxy like for a replica; both restart within seconds."""
     transport = kind(f"http://127.0.0.1:{free_port()}", CodecChoice("raw"))
     with pytest.raises(NoReplica, match="is it running"):
         transport.call([Request("reset", Obs(), request_id="1")], 1.0)

@@ -1,5 +1,5 @@
-"""A connection that its server ends politely, as RFC 6455 has it: a last message, and then the
-line; and one whose server does not read.
+"""A connection that its server closes as RFC 6455 requires, with a last message before the close;
+and a connection whose server does not read.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from vlagents_ray.errors import PolicyUnavailable
 
 @contextlib.contextmanager
 def serving(handle: Callable[[ServerConnection], None], **options: Any) -> Iterator[int]:
-    """The port of a WebSocket server."""
+    """Run a WebSocket server, and yield its port."""
     with serve(handle, "127.0.0.1", 0, **options) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
@@ -80,7 +80,7 @@ def test_a_message_arrives_whole_in_pieces_of_any_length() -> None:
             assert [received.get(timeout=30) for _ in range(3)] == [b"before", message, b"after"], (
                 size
             )
-        stream.send_pieces([b"a"] * 2000, 30)  # more than the kernel takes at once
+        stream.send_pieces([b"a"] * 2000, 30)  # more than the kernel's buffers take
         assert received.get(timeout=30) == b"a" * 2000
 
 
@@ -97,7 +97,7 @@ def test_a_server_that_closes_after_an_answer_is_noticed_by_the_next_request(
 ) -> None:
     stream.send(b"answer first", 5)
     assert stream.recv(30) == b"answered"
-    with pytest.raises((ConnectionClosed, OSError)):  # noqa: PT012 - by whichever hears of it
+    with pytest.raises((ConnectionClosed, OSError)):  # noqa: PT012 - either side may raise it
         stream.send(b"answer first", 5)
         stream.recv(30)
 
@@ -141,7 +141,7 @@ def test_the_key_is_in_no_log(port: int, caplog: pytest.LogCaptureFixture) -> No
         for record in caplog.records
         if not record.name.startswith("websockets.server")
     ]
-    assert "> Sec-WebSocket-Version: 13" in client  # the others are logged
+    assert "> Sec-WebSocket-Version: 13" in client  # the other headers are logged
     assert not [line for line in client if "the-secret-key" in line]
 
 
@@ -150,7 +150,7 @@ def test_the_key_is_in_no_log(port: int, caplog: pytest.LogCaptureFixture) -> No
 def test_a_proxy_that_hardly_reads_does_not_hold_up_the_sender(
     has_tls: bool, read_bytes: int, tmp_path: Path
 ) -> None:
-    """The kernel's own limit would begin again at each read, and has no effect on TLS."""
+    """The kernel's own time limit restarts at each read, and does not apply to TLS."""
     context, credentials = None, Credentials("")
     if has_tls:
         own = authority(tmp_path, "lab")
@@ -169,7 +169,7 @@ def test_a_proxy_that_hardly_reads_does_not_hold_up_the_sender(
 
 @pytest.mark.parametrize("read_bytes", [0, 4096], ids=["takes nothing", "takes little"])
 def test_a_connection_that_cannot_send_is_closed_in_time(read_bytes: int) -> None:
-    """Its closing frame waits behind a message that another thread sends."""
+    """Its close frame waits behind a message that another thread is sending."""
     with deaf_server(read_bytes) as port:
         proxied = ProxiedSocket(f"ws://127.0.0.1:{port}/", Credentials(""), 5)
 

@@ -1,5 +1,5 @@
-"""The opening handshake with a server that does not answer it, such as a frozen one behind a
-proxy, and with one that answers at once.
+"""The opening handshake with a server that does not answer it, such as a frozen one behind a proxy,
+and with a server that answers at once.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.websocket import ProxiedSocket
 
 LIMIT_S = 0.5
-SILENT_S = 20.0  # for which the server keeps a connection
+SILENT_S = 20.0  # time for which the server keeps a connection
 
 
 @contextlib.contextmanager
 def silent_server(context: ssl.SSLContext | None) -> Iterator[int]:
-    """A server's port; it ends each TLS handshake, with session tickets, and sends nothing more."""
+    """Yield the port of a server that completes each TLS handshake, with session tickets, and sends
+    nothing more.
+    """
     ended = threading.Event()
 
     def serve(listener: socket.socket) -> None:
-        with contextlib.suppress(OSError):  # the client or the test has gone
+        with contextlib.suppress(OSError):  # the client or the test has ended
             connection = listener.accept()[0]
             if context is not None:
                 connection = context.wrap_socket(connection, server_side=True)
@@ -60,7 +62,9 @@ def test_the_opening_handshake_ends_at_its_limit(scheme: str, tmp_path: Path) ->
 
 
 def test_no_opening_handshake_over_tls_is_lost(tmp_path: Path) -> None:
-    """One of a hundred was, while another thread read the server's session ticket."""
+    """In an earlier version one handshake in a hundred was lost, while another thread read the
+    server's session ticket.
+    """
     ours = authority(tmp_path, "ours")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(*ours.sign("server"))

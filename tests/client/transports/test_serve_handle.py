@@ -1,5 +1,5 @@
-"""What a Ray that broke makes of a call through a Serve handle: an infrastructure failure, never
-the policy's.
+"""Errors of a broken Ray in a call through a Serve handle are infrastructure failures, never the
+policy's.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def test_a_frame_that_neither_store_nor_disk_has_room_for_is_not_sent(
     with pytest.raises(PolicyUnavailable, match=r"\d+ bytes cannot be sent") as raised:
         HandleTransport("app").call([REQUEST], 1)
     assert not isinstance(raised.value, ConnectionLost), (
-        "that would say that it may have been executed"
+        "this error would mean that the call may have been executed"
     )
 
 
@@ -74,7 +74,9 @@ def test_a_replica_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_frame_is_sent_again_with_the_pause_that_it_may_have_waited_in(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The replica has not executed it, and learns so that its client still waits."""
+    """The replica has not executed the frame. The repeated frame tells it that its client still
+    waits.
+    """
     reply = encode_replies([Reply("r", act=Act(np.ones(2, np.float32)))])
     pauses: list[float] = []
     answers: Iterator[Any] = iter([7.5, reply, reply])
@@ -117,8 +119,8 @@ class TestConnecting:
     def test_one_that_hangs_is_not_waited_for_while_another_may_answer(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """`reset` connects with `connect_timeout_s`, a minute: all of it went to the replica
-        that was chosen first.
+        """`reset` connects with `connect_timeout_s`, a minute. In an earlier version, the replica
+        that was tried first used up all of it.
         """
         cancelled: list[bool] = []
         result = Mock(side_effect=[TimeoutError, TimeoutError, ({"policy": "p"}, "replica")])
@@ -126,4 +128,4 @@ class TestConnecting:
         attach = SimpleNamespace(remote=lambda *_: attaching)
         monkeypatch.setattr(serve, "get_app_handle", lambda _: SimpleNamespace(attach=attach))
         assert HandleTransport("app").connect(60) == {"policy": "p"}
-        assert len(cancelled) == 2, "asked on, of a replica whose answer nobody wants"
+        assert len(cancelled) == 2, "the abandoned calls to other replicas must be cancelled"

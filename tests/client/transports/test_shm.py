@@ -1,5 +1,5 @@
-"""Shared memory and plasma: who can use them, decided before anything is sent, and servers that
-hang.
+"""Shared memory and plasma: whether they can be used is decided before anything is sent; and
+servers that hang.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def listening(address: str) -> Iterator[socket.socket]:
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put this process on the node of the replica."""
+    """Simulate that this process is on the node of the replica."""
     monkeypatch.setattr("vlagents_ray.client.transports.serve_handle.this_node", lambda: HERE)
 
 
@@ -60,8 +60,8 @@ def test_requests_to_a_server_that_hangs_take_no_more_memory_than_it_would_accep
 def test_a_server_of_another_user_is_sent_nothing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Neither a key nor an observation: whoever takes the name of a server that has ended would
-    command the robot.
+    """Neither a key nor an observation is sent. Otherwise a process that takes over the name of an
+    ended server could command the robot.
     """
     monkeypatch.setattr("vlagents_ray.client.transports.shm.peer_uid", lambda _: os.getuid() + 1)
     for keyed in (False, True):
@@ -122,7 +122,7 @@ def test_a_connection_that_fails_is_closed_at_once(
                 "vlagents_ray.client.transports.shm._require_same_user", Mock(side_effect=broken)
             )
             before = os.listdir("/proc/self/fd")
-            # Which holds the frame with the socket.
+            # The traceback keeps the frame that refers to the socket.
             with pytest.raises((type(broken), PolicyUnavailable)) as raised:
                 connect_plasma({"socket": str(tmp_path / "s"), "node": HERE})
             assert len(os.listdir("/proc/self/fd")) == len(before), raised.value

@@ -1,5 +1,5 @@
-"""A replica that does not answer: a client finds out whether its process is alive, and leaves it if
-it is not.
+"""A replica that does not answer: a client checks whether its process is alive, and leaves the
+replica if it is not.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ TRANSPORTS = ("shm", "websocket", "http")
 
 
 class Gated(Agent):
-    """Counts its acts, and waits for a gate where it is told to."""
+    """A policy that counts its acts, and waits for a gate if the observation requests it."""
 
-    gate: threading.Event  # gate of all sessions, as the next one
+    gate: threading.Event  # gate of all sessions
     acts: list[str]
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -50,13 +50,13 @@ class Gated(Agent):
 
 
 class Watch(ReplicaWatch):
-    """Notes signs of life and silences."""
+    """Records signs of life and silences."""
 
     def __init__(self, limit_s: float = float("inf")) -> None:
         super().__init__(self._note_silence)
         self.limit_s = limit_s
         self.pinged = False
-        self.signs = threading.Event()  # a sign of life since a ping
+        self.signs = threading.Event()  # whether there was a sign of life since a ping
         self.silent = threading.Event()
 
     def _note_silence(self, silent_s: float, is_proxied: bool) -> None:
@@ -72,7 +72,7 @@ class Watch(ReplicaWatch):
 
 
 class Replica:
-    """A policy at both of its endpoints."""
+    """A policy with an endpoint for each transport."""
 
     def __init__(self) -> None:
         Gated.gate, Gated.acts = threading.Event(), []
@@ -103,7 +103,7 @@ class Replica:
         return stream
 
     def freeze(self) -> None:
-        """Let no thread read the connections until the gate opens."""
+        """Block all threads that read the connections until the gate opens."""
         frozen = threading.Event()
         self.engine.queue.poller.call_soon(lambda: (frozen.set(), Gated.gate.wait(60)))
         assert frozen.wait(20)
@@ -132,7 +132,7 @@ def request(op: Any, name: str, **info: Any) -> Request:
 def test_a_replica_answers_pings_while_its_policy_is_at_work(
     replica: Replica, transport: str
 ) -> None:
-    """In its first long act after short ones, when no other thread polls yet."""
+    """During the first long act after short ones, no other thread polls yet."""
     watch = Watch()
     client = replica.client(transport, watch)
     assert client.call([request("reset", "a")], 20)[0].error is None
@@ -196,7 +196,7 @@ def test_a_replica_that_continues_in_time_is_not_left(replica: Replica, transpor
 def test_through_the_proxy_only_the_replica_of_the_call_shows_that_it_is_alive(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The proxy gives later pings to another replica when it marks this one as down."""
+    """The proxy sends later pings to another replica when it marks this one as down."""
     answering = ["a"]
 
     def exchange(*_: Any) -> tuple[int, str, bytes]:
@@ -215,7 +215,7 @@ def test_through_the_proxy_only_the_replica_of_the_call_shows_that_it_is_alive(
     answering[0] = "a"
     assert probe()
 
-    # A call that arrives at another replica than the one before.
+    # This call reaches another replica than the call before.
     answering[0] = "b"
     probe = http._ProxiedProbe(url, Credentials(""), "session", answered_by)
     assert probe()
@@ -230,7 +230,7 @@ def test_a_local_client_that_floods_pings_is_cut_off(replica: Replica) -> None:
     connection.settimeout(20)
 
     def answered_pings() -> int:
-        """The number of pings that are answered before the connection ends."""
+        """Return the number of pings that are answered before the connection ends."""
         for number in range(1000 * CONTROL_FRAMES):
             try:
                 connection.send(LocalAddress.PING)

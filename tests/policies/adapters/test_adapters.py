@@ -1,5 +1,5 @@
-"""LoRA adapters chosen by session: one pass for rows of different adapters, each as if merged
-into the base alone.
+"""LoRA adapters selected per session: one pass for rows with different adapters, each as if its
+adapter alone were merged into the base.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def begun(policy: Small, seed: int, **options: Any) -> Any:
 
 
 def three(tmp_path: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Adapters of different ranks and layers, saved."""
+    """Save adapters of different ranks and layers, and return them."""
     made = {
         "stack": pairs(network(tmp_path), LAYERS, 4, seed=1),
         "pour": pairs(network(tmp_path), LAYERS, 2, seed=2),
@@ -84,7 +84,7 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(tmp_path: Path) -
         wanted = begun(alone, seed).act(at(seed, **{SAMPLES: seed % 3}))
         assert isinstance(act, Act)
         np.testing.assert_allclose(act.action, wanted.action, rtol=RTOL, atol=RTOL)
-        assert name is None or np.abs(act.action - plain).max() > 0.1  # the adapter matters
+        assert name is None or np.abs(act.action - plain).max() > 0.1  # the adapter has an effect
         if seed % 3:
             np.testing.assert_allclose(
                 act.info[DISTRIBUTION]["samples"],
@@ -108,7 +108,8 @@ def test_passes_of_two_threads_each_have_the_adapters_of_their_rows(tmp_path: Pa
         found[name] = begun(policy, 0, adapter=name).act(at(0)).action
 
     wanted = {name: begun(policy, 0, adapter=name).act(at(0)).action for name in ("stack", "pour")}
-    for place in (0, 2):  # whose adapters are then those of one thread before both have used them
+    # here one thread's adapters would apply to both before both threads have used them
+    for place in (0, 2):
         policy.model["head"][place].register_forward_pre_hook(meet)
     threads = [threading.Thread(target=act, args=[name]) for name in wanted]
     for thread in threads:
@@ -151,7 +152,7 @@ def test_acts_and_resets_say_which_adapter_it_was(tmp_path: Path) -> None:
     assert "weights" not in begun(policy, 0).reset(at(0), None)
     without = loaded(tmp_path, adapters=paths(tmp_path, "pour"))
     assert without.weights_id is not None
-    # Another adapter beside it changes nothing.
+    # An additional adapter changes nothing.
     assert without.weights_id["adapters"] == {"pour": ids["pour"]}
     assert without.weights_id["digest"] == policy.weights_id["digest"]
 
@@ -222,7 +223,7 @@ def test_another_kind_of_adapter_is_refused(
     tmp_path: Path, config: dict[str, Any], says: str | None
 ) -> None:
     save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2), **config)
-    if says is None:  # a local folder may be a copy of what the hub has under that name
+    if says is None:  # a local folder may be a copy of a repository on the hub
         loaded(tmp_path, adapters=paths(tmp_path, "stack"))
         return
     with pytest.raises(ConfigError, match=f"adapter 'stack': .*{says}"):
@@ -313,7 +314,7 @@ def test_a_truncated_or_absent_file_is_refused(tmp_path: Path) -> None:
         ConfigError, match=r"adapter 'stack': .*is damaged, or has a different format"
     ):
         loaded(tmp_path, adapters=paths(tmp_path, "stack"))
-    file.rename(folder / "adapter_model.bin")  # a pickle, by its name
+    file.rename(folder / "adapter_model.bin")  # a pickle, according to its name
     with pytest.raises(
         ConfigError, match=r"adapter 'stack': .*expected \['adapter_model.safetensors'\] in it"
     ):

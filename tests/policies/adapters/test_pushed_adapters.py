@@ -1,5 +1,5 @@
-"""A learner that trains one adapter pushes its values alone; everything else acts as before, to
-the bit.
+"""A learner that trains one adapter pushes only its values; all other actions stay
+bit-identical.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ A = "stack/base_model.model.see.lora_A.weight"
 
 @pytest.fixture
 def values(tmp_path: Path) -> dict[str, dict[str, np.ndarray]]:
-    """The saved values of each adapter, and under "trained" what a learner makes of those of
-    "stack".
+    """Return the saved values of each adapter, and under "trained" the values of "stack" after
+    training.
     """
     network = made(tmp_path).model
     found = {name: pairs(network, LAYERS, rank, seed=rank) for name, rank in RANKS.items()}
@@ -91,8 +91,8 @@ def act(engine: Engine, name: str | None) -> Act:
 
 
 def played(engine: Engine) -> dict[str | None, tuple[bytes, dict[str, Any]]]:
-    """The first action of an episode with each adapter and without one, and the weights that it
-    states.
+    """Return the first action of an episode with each adapter and without one, with the reported
+    weights.
     """
     found = {}
     for name in ("stack", "pour", None):
@@ -125,7 +125,7 @@ def test_a_pushed_adapter_acts_as_the_saved_one_and_all_else_as_before(
     assert {name: action for name, (action, _) in after.items()} == {
         name: action for name, (action, _) in saved.items()
     }
-    assert after[None] == before[None], "the base's weights are not the learner's"
+    assert after[None] == before[None], "the base's weights must not be replaced"
     assert [after[name][0] for name in ("pour", None)] == [
         before[name][0] for name in ("pour", None)
     ]
@@ -147,7 +147,7 @@ def test_a_replica_that_starts_later_states_and_does_the_same(
     engines = [
         serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)
     ]
-    # As a training begins.
+    # The state at the beginning of a training.
     push(engines[0], pushed(values["stack"]), partial=True, allow_same=True)
     [held] = [one for one in engines[0].weights.pushed_versions() if one.number]
     engines[1].weights.stage(held.number, held.values, PushOptions(allow_same=True))
@@ -166,7 +166,7 @@ def test_sessions_of_two_versions_keep_theirs_until_their_reset(
         reset(engine, "stack")
     pushing, still = engines
     push(pushing, pushed(values["trained"]), partial=True)
-    reset(pushing, "pour")  # makes the version the agent's
+    reset(pushing, "pour")  # makes this version the agent's
     acts = [act(engine, "stack") for engine in engines]
     assert acts[0].action.tobytes() == acts[1].action.tobytes()
     assert acts[0].info["policy"] == acts[1].info["policy"]

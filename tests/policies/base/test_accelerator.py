@@ -43,7 +43,7 @@ OLD = "The NVIDIA driver on your system is too old (found version 12040)"
 
 
 def without_cuda(patch: pytest.MonkeyPatch) -> None:
-    """Let torch be one whose CUDA the driver does not support."""
+    """Simulate a torch whose CUDA version the driver does not support."""
 
     def empty(*_: Any, device: Any) -> None:
         if device.type == "cuda":
@@ -86,7 +86,7 @@ def test_what_a_gpu_is_is_reported(monkeypatch: Any) -> None:
     with loading_report(lambda _: None) as report:
         torch_device("auto")
     [device] = report.devices
-    assert device.pop("driver", "") is None or device  # that of this machine, if it has one
+    assert device.pop("driver", "") is None or device  # this machine's driver, if it has one
     assert device == {
         "kind": "cuda",
         "device": "cuda",
@@ -123,7 +123,7 @@ def test_a_share_of_a_gpu_is_a_limit_of_its_memory(
         torch_device()
     assert limits == ([] if share is None else [(0.5, torch.device("cuda"))])
     assert os.environ.get("XLA_PYTHON_CLIENT_MEM_FRACTION") == share, (
-        "beside torch, as in openpi's port"
+        "in addition to torch, as in openpi's port"
     )
     tensors = [cuda.tensor(torch.zeros(10**6))]
     free = (80 if share is None else 40) * 10**9 - 4 * 10**6
@@ -171,7 +171,7 @@ def test_the_memory_of_jax_is_that_of_its_device(monkeypatch: Any) -> None:
 
 
 class FakeJax:
-    """A JAX whose plugin for GPUs did not load."""
+    """A JAX whose GPU plug-in failed to load."""
 
     __version__ = "0.5.3"
     config = SimpleNamespace(jax_compilation_cache_dir="set")
@@ -311,17 +311,15 @@ def test_errors_of_onnx_runtime_are_told_apart(
 ) -> None:
     classes = pytest.importorskip("onnxruntime.capi.onnxruntime_pybind11_state")
     error = getattr(classes, name)(f"[ONNXRuntimeError] : {text}")
-    assert not isinstance(error, RuntimeError), (
-        "otherwise the class of the error would need no rule"
-    )
+    assert not isinstance(error, RuntimeError), "the error's class alone must not identify it"
     assert (is_out_of_memory(error), is_device_failure(error)) == (exhausted, failed)
-    own = ValueError(str(error))  # a request's text is no error of a device
+    own = ValueError(str(error))  # the text of a request does not make an error a device error
     assert not is_out_of_memory(own)
     assert not is_device_failure(own)
 
 
 class Crowded(ModelPolicy):
-    """A model on a GPU whose memory holds a few rows; its actions are noise."""
+    """A model on a GPU whose memory has room for a few rows; its actions are noise."""
 
     Config = ModelConfig
     fits = 3
@@ -482,7 +480,7 @@ def test_after_a_shortage_of_memory_the_passes_grow_again(
         now[0] += FIRST_WAIT_S - 1
     assert reached == [*limits[1:], 12, 12]
     policy.model["passes"].clear()
-    policy.report.pass_s.clear()  # otherwise two faster passes may take its place
+    policy.report.pass_s.clear()  # otherwise two faster passes might be used instead
     acted(policy, 9)
     assert policy.model["passes"] == [9 if sizes is None else 12]
 
@@ -538,7 +536,7 @@ def test_one_row_that_does_not_fit_is_an_error_and_counted(monkeypatch: pytest.M
     engine = Engine(policy)
     engine.start()
     try:
-        # The full batch, and half of it, while it loaded.
+        # Errors with the full batch and with half of it, during loading.
         assert engine.stats.collect().out_of_memory == 2
         monkeypatch.setattr(Crowded, "fits", 0)
         with pytest.raises(torch.OutOfMemoryError):
@@ -564,7 +562,7 @@ def test_the_time_of_a_batch_on_the_gpu_is_reported_at_the_next_one(
     policy = Crowded.from_config({"checkpoint": "none", "max_rows": 3})
     engine = Engine(policy, EngineSettings(threaded=False))
     engine.start()
-    assert engine.stats.gpu_ms is None, "of the start"
+    assert engine.stats.gpu_ms is None, "the report must be from the start"
     for rows in (1, 3):
         acted(policy, rows)
     assert engine.stats.gpu_ms == 1
@@ -574,4 +572,4 @@ def test_the_time_of_a_batch_on_the_gpu_is_reported_at_the_next_one(
     assert engine.stats.gpu_ms == 3
     monkeypatch.setattr(Crowded, "fits", 3)
     acted(policy, 1)
-    assert engine.stats.collect().gpu_ms.count == 2, "there is none of a pass that failed"
+    assert engine.stats.collect().gpu_ms.count == 2, "a failed pass has no time"

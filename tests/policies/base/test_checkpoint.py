@@ -1,5 +1,5 @@
-"""Checkpoints: found by name, step or commit, held whole by the model, and known by their
-digest.
+"""Checkpoints: found by name, step or commit, completely loaded by the model, and identified by
+their digest.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def model() -> Any:
     layers = torch.nn.Sequential(
         torch.nn.Linear(8, 8), torch.nn.BatchNorm1d(8), torch.nn.Linear(8, 8)
     )
-    layers[2].weight = layers[0].weight  # tied
+    layers[2].weight = layers[0].weight  # tied weights
     return layers
 
 
@@ -118,7 +118,8 @@ def test_what_is_missing_other_or_too_much_is_named(params: dict[str, Any], mess
         require_filled(params, WANTED)
 
 
-TENSORS, LENGTH = 40, 300_000  # bytes of each: 12 MB together, more than is read from end to end
+# bytes of each tensor, 12 MB in total, of which only a sample is read
+TENSORS, LENGTH = 40, 300_000
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
@@ -253,7 +254,7 @@ def test_the_commit_is_that_of_the_policy_and_not_of_an_encoder_beside_it(
 
 
 class RevisionNotFoundError(Exception):
-    """Stands in for that of huggingface_hub, known by its name."""
+    """A stand-in for huggingface_hub's error, which is recognized by its name."""
 
 
 def test_a_revision_that_is_not_there_is_named_with_those_that_are(
@@ -273,7 +274,7 @@ def test_a_revision_that_is_not_there_is_named_with_those_that_are(
         match=r"expected a commit, a branch or a tag of org/name, got 'v2'.*are main, v1$",
     ):
         find_checkpoint("org/name@v2")
-    del hub.HfApi  # such as without a network
+    del hub.HfApi  # for example without a network
     with pytest.raises(ConfigError, match=r"got 'v2'.*not known here"):
         find_checkpoint("org/name@v2")
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""What is done to torchvision and LeRobot in the environments that `venv create` makes, shown with
+"""The changes to torchvision and LeRobot in environments that `venv create` makes, tested with
 small packages.
 """
 
@@ -21,7 +21,7 @@ class Library:
     def define(self, schema): defined.append("torchvision::" + schema.partition("(")[0])
 library = SimpleNamespace(Library=Library)
 """
-# As torchvision's: a submodule that loads, then one that looks up an operator.
+# A package like torchvision: one submodule that loads, and one that looks up an operator.
 TORCHVISION = """
 from torchvision import io
 import torch
@@ -43,7 +43,7 @@ print(torchvision.ready, torch.defined, codec(), decode.__name__)
 
 
 class Packages:
-    """A folder of importable packages, in which the fixes are as `venv create` puts them there."""
+    """A folder of importable packages, with the fixes as `venv create` installs them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -55,7 +55,9 @@ class Packages:
         (path / "__init__.py").write_text(text)
 
     def run(self, code: str) -> tuple[str, str]:
-        """What the code printed after the fixes were installed, and its last line on stderr."""
+        """Return the output of the code after the fixes were installed, and its last line on
+        stderr.
+        """
         done = subprocess.run(
             [sys.executable, "-S", "-c", f"import fixes; fixes.install(); fixes.install()\n{code}"],
             env={"PYTHONPATH": str(self.folder)},
@@ -68,8 +70,8 @@ class Packages:
 
 @pytest.fixture
 def packages(tmp_path: Path) -> Packages:
-    """Those of a laptop: a torch without CUDA, a torchvision with it and without a video reader,
-    no torchcodec.
+    """Return the packages of a laptop: a torch without CUDA, a torchvision with CUDA and without a
+    video reader, and no torchcodec.
     """
     made = Packages(tmp_path)
     made.write("torch", TORCH.format(cuda=None))

@@ -1,4 +1,4 @@
-"""Images of any size centred in black, and the tokens of instructions that are kept."""
+"""Images of any size, centred on black, and the cached tokens of instructions."""
 
 from __future__ import annotations
 
@@ -48,4 +48,4 @@ def test_few_instructions_are_kept_and_none_that_is_very_long() -> None:
     for number in range(KEPT):
         tokens(f"lift {number}")
     tokens("lift")
-    assert asked.count("lift") == 2, "the one used least recently was dropped"
+    assert asked.count("lift") == 2, "the least recently used entry must be dropped"

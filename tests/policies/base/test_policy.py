@@ -1,5 +1,5 @@
-"""What every model family inherits: sessions, chunks, samples, batches, shown on a model of
-three lines.
+"""The inherited features of all model families: sessions, chunks, samples and batches, tested with
+a model of three lines.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ HORIZON, DIM = 4, 2
 
 
 class Wobble(ModelPolicy):
-    """Row h of a chunk: the sum of the last two states, plus h, plus a little of the session's
-    noise.
+    """A model whose row h of a chunk is the sum of the last two states, plus h, plus a little of
+    the session's noise.
     """
 
     Config = ModelConfig
@@ -95,7 +95,7 @@ def test_keeps_the_contract(config: dict[str, Any]) -> None:
 
 
 class Stepping(Wobble):
-    """Draws for all rows of a pass, and again for all of them, as flows with random steps do."""
+    """A model that draws noise for all rows of a pass twice, like flows with random steps."""
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         first = [row.noise(HORIZON, DIM) for row in rows]
@@ -135,7 +135,7 @@ def test_rows_that_share_observations_are_encoded_in_a_size_of_their_own_or_each
 
 
 class Compiled(Wobble):
-    """One that JAX computes."""
+    """A model that JAX computes."""
 
     def load(self) -> Any:
         report_device({"kind": "cpu", "jax": "0.5.3"})
@@ -171,7 +171,7 @@ def test_nine_rows_are_a_pass_of_eight_and_one_of_one_where_that_is_faster() -> 
     assert passes("cuda", _1=8.0, _8=8.0, _16=9.0) == [16]
     assert sorted(passes("cuda", _1=1.0, _8=1.0, _16=9.0)) == [1, 8]
     assert passes("cpu", _1=1.0, _8=1.0, _16=9.0) == [16]
-    assert passes("cuda", _1=1.0, _8=1.0) == [16], "not measured yet"
+    assert passes("cuda", _1=1.0, _8=1.0) == [16], "the pass has not been measured yet"
     for actions in found:
         np.testing.assert_array_equal(actions, found[0])
 
@@ -180,7 +180,7 @@ def test_nine_rows_are_a_pass_of_eight_and_one_of_one_where_that_is_faster() -> 
     ("rows", "pass_s", "want"),
     [
         (9, {1: 2.0, 8: 5.0, 16: 9.0}, [1, 8]),
-        (9, {1: 4.0, 8: 5.0, 16: 9.0}, [9]),  # a pass that takes as long
+        (9, {1: 4.0, 8: 5.0, 16: 9.0}, [9]),  # one pass takes as long as two
         (16, {1: 1.0, 8: 5.0, 16: 12.0}, [8, 8]),
         (11, {1: 1.0, 2: 1.5, 8: 5.0, 16: 12.0}, [1, 2, 8]),
         (3, {4: 1.0, 8: 5.0}, [3]),
@@ -195,7 +195,7 @@ def test_the_split_with_the_shortest_time_is_found(
 
 
 class CountsViews(Wobble):
-    """Its actions change with the number of views that are encoded."""
+    """A model whose actions change with the number of encoded views."""
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         firsts, _ = shared_frames(rows)
@@ -298,7 +298,8 @@ def test_padding_has_no_observations_of_its_own() -> None:
     for session in sessions:
         session.reset(at(0.0), "go")
     acts = policy.act_batch([at(0.0, **{SAMPLES: 3}), at(1.0)], sessions)
-    assert [set(act.action.ravel()) for act in acts] == [{2}, {2}]  # of eight rows
+    # two views instead of eight rows
+    assert [set(act.action.ravel()) for act in acts] == [{2}, {2}]
 
 
 def test_a_queue_asks_the_model_every_execute_acts_and_remembers_every_observation() -> None:
@@ -306,9 +307,9 @@ def test_a_queue_asks_the_model_every_execute_acts_and_remembers_every_observati
     session = begun(policy)
     rows = [session.act(at(float(x))).action for x in range(4)]
     assert len(policy.model["batches"]) == 2
-    # The chunk of the first observation, seen twice.
+    # The chunk of the first observation, which counts twice.
     assert [round(float(row[0])) for row in rows[:3]] == [0, 1, 2]
-    # The last two observations, although the model saw neither of them alone.
+    # The sum of the last two observations, although the model was not called for either alone.
     assert round(float(rows[3][0])) == 2 + 3
 
 
@@ -329,9 +330,11 @@ def test_a_plan_in_whose_place_others_were_executed_is_dropped(actions: str) -> 
     session = begun(loaded(actions=actions))
     session.act(at(0.0))
     told = session.act(at(10.0, executed_actions=np.ones((3, DIM), np.float32)))
-    assert told.action[0] == pytest.approx(10, abs=0.1), "row 0 of the chunk for what a human left"
+    assert told.action[0] == pytest.approx(10, abs=0.1), (
+        "row 0 of the chunk for the scene that a human left"
+    )
     assert session.episode is not None
-    assert len(session.episode.frames) == 2, "its history is what it has seen"
+    assert len(session.episode.frames) == 2, "its history must be its observations"
 
 
 def test_samples_come_with_their_mean_and_change_no_action() -> None:
@@ -347,7 +350,7 @@ def test_samples_come_with_their_mean_and_change_no_action() -> None:
 
 
 class Learnt(Wobble):
-    """States the sum of a chunk, and as its replay the chunk."""
+    """A model that returns the sum of a chunk as its value, and the chunk as its replay data."""
 
     @property
     def contract(self) -> Contract:
@@ -449,7 +452,7 @@ def test_a_broken_chunk_fails_one_tick_and_is_kept_for_no_later_one(actions: str
     broken, whole = policy.act_batch([at(np.nan), at(1.0)], [bad, good])
     assert isinstance(broken, InvalidAction)
     assert isinstance(whole, Act)
-    bad.episode.frames.clear()  # of which the broken one would be seen once more
+    bad.episode.frames.clear()  # otherwise the broken observation would be used once more
     assert np.isfinite(bad.act(at(1.0)).action).all()
 
 

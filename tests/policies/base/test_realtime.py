@@ -1,4 +1,4 @@
-"""Real-time chunking, shown on a flow whose answer is known: its velocity points straight at a
+"""Real-time chunking, tested on a flow with a known result: its velocity points straight at a
 target.
 """
 
@@ -15,7 +15,7 @@ from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import FlowPasses, Guide
 
 HORIZON, DIM, STEPS = 8, 3, 10
-TARGET = 2.0  # target of the model, for each number of each row
+TARGET = 2.0  # the model's target for each number of each row
 
 
 def row(leftover: np.ndarray | None = None, delay: int = 0) -> Row:
@@ -23,7 +23,7 @@ def row(leftover: np.ndarray | None = None, delay: int = 0) -> Row:
 
 
 def flow(*rows: Row, steps: int = STEPS, limit: float = 5.0) -> np.ndarray:
-    """(B, H, D) actions, as a policy makes them."""
+    """Return (B, H, D) actions, computed like a policy."""
     noise = np.random.default_rng(0).standard_normal((len(rows), HORIZON, DIM)).astype(np.float32)
     guide = Guide.for_rows(rows, HORIZON, DIM)
     actions = noise
@@ -51,7 +51,8 @@ def test_rows_within_the_delay_are_the_plan(delay: int) -> None:
 
 def test_later_rows_follow_less_and_less_and_not_at_all_after_the_plan() -> None:
     left = np.zeros((6, DIM), np.float32)
-    distance = np.abs(flow(row(left, 2))[0]).mean(1)  # to the plan; without one it is TARGET
+    # distance to the plan; without a plan it would be TARGET
+    distance = np.abs(flow(row(left, 2))[0]).mean(1)
     assert (np.diff(distance[1:7]) > 0).all()
     np.testing.assert_allclose(distance[6:], TARGET, rtol=1e-5)
 
@@ -73,11 +74,11 @@ def test_a_delay_beyond_the_plan_and_a_plan_beyond_the_horizon_are_cut_to_it() -
     np.testing.assert_allclose(flow(row(plan(20), 20))[0], plan(20)[:HORIZON], atol=1e-6)
 
 
-STEP = 0.25  # by which the policy below continues in each row
+STEP = 0.25  # increment between the rows of the policy below
 
 
 class Prefixed(FlowPasses):
-    """A policy that was trained with prefixes: its rows go on from the last one at time 0, by
+    """A policy that was trained with prefixes. Its rows continue from the last row at time 0, by
     STEP each.
     """
 
@@ -94,12 +95,12 @@ class Prefixed(FlowPasses):
         start = actions[torch.arange(len(actions)), last.clamp(min=0)] * (last >= 0)[:, None]
         behind = torch.arange(HORIZON)[None, :, None] - last[:, None, None]
         wanted = (actions - start[:, None] - STEP * behind) / times.clamp(min=1e-6)[..., None]
-        # Of given rows, no velocity was ever trained.
+        # The velocity of given rows was never trained.
         return torch.where(given[..., None], 100.0, wanted)
 
 
 def prefixed(*rows: Row) -> np.ndarray:
-    """(B, H, D) actions of `Prefixed`."""
+    """Return (B, H, D) actions of `Prefixed`."""
     import torch
 
     passes = Prefixed(torch.nn.Identity(), Compilation(False))
@@ -135,7 +136,7 @@ def test_a_given_prefix_comes_back_unchanged_and_the_rest_continues_it(delay: in
 def test_prefixes_of_other_lengths_in_a_batch_do_not_matter() -> None:
     rows = [row(plan(), 2), row(), row(plan(3), 5)]
     both = prefixed(*rows)
-    np.testing.assert_allclose(np.diff(both[1], axis=0), STEP, atol=1e-5)  # without a plan
+    np.testing.assert_allclose(np.diff(both[1], axis=0), STEP, atol=1e-5)  # the row without a plan
     for one, delay in ((0, 2), (2, 3)):
         np.testing.assert_allclose(
             both[one], prefixed([row(plan(), 2), row(), row(plan(3), 5)][one])[0], atol=1e-6

@@ -1,5 +1,5 @@
-"""Rows on their way to the policy's device: pinned, on a stream of their own, stacked there
-without a wait.
+"""Transfers of rows to the policy's device: pinned, on a separate stream, and stacked there without
+a wait.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CUDA = torch.device("cuda", 0)
 
 
 def arrays(seed: int, side: int = 5) -> dict[str, np.ndarray]:
-    """Arrays of odd sizes and of all types that policies use."""
+    """Return arrays of odd sizes and of all types that policies use."""
     rng = np.random.default_rng(seed)
     return {
         "image": rng.integers(0, 256, (side, side, 3), np.uint8),
@@ -93,11 +93,11 @@ def test_a_gpu_copies_rows_of_other_threads_and_the_batch_waits_for_the_copies(
     for thread in threads:
         thread.join()
     blocks = [row.block for row in rows]
-    # None is copied yet.
+    # None has been copied yet.
     assert not any(torch.equal(block.values, cuda.pinned[0]) for block in blocks)
     require_stacked(staging.stack(rows), *map(arrays, range(4)))
     assert all(block.streams == [cuda.current_stream(CUDA)] for block in blocks)
-    assert all(row.block is None for row in rows)  # only waiting requests take memory there
+    assert all(row.block is None for row in rows)  # only waiting requests use memory there
     require_stacked(staging.stack(rows[:1]), arrays(0))
 
 
@@ -118,7 +118,7 @@ def test_a_gpu_takes_an_array_in_the_order_of_the_current_stream(cuda: FakeCuda)
 
 def test_a_row_moves_to_another_replica_as_arrays_and_is_copied_there(cuda: FakeCuda) -> None:
     row = Staging(CUDA).stage(arrays(0))
-    moved = pickle.loads(pickle.dumps(row))  # noqa: S301 - of this test
+    moved = pickle.loads(pickle.dumps(row))  # noqa: S301 - data of this test
     assert (moved.block, moved.copied) == (None, None)
     require_stacked(Staging("cpu").stack([moved]), arrays(0))
     staging = Staging(CUDA)

@@ -1,4 +1,6 @@
-"""CUDA graphs on a GPU of a fake torch: what they record, and what may not run beside a capture."""
+"""CUDA graphs on a simulated GPU: what they record, and which work must not run during a
+capture.
+"""
 
 from __future__ import annotations
 
@@ -132,7 +134,7 @@ def test_a_held_argument_is_changed_in_place_and_not_copied_again(
             in_graph[:, entry] = float(entry)
         assert held(core, 1, in_graph).data_ptr() == in_graph.data_ptr()
 
-    for other in (torch.randn(5, 5, DIM), torch.randn(2, 6, DIM)):  # of no graph
+    for other in (torch.randn(5, 5, DIM), torch.randn(2, 6, DIM)):  # no graph has these sizes
         cache = cuda.tensor(other)
         assert held(core, 1, cache) is cache
     cache = cuda.tensor(torch.randn(2, 5, DIM))
@@ -140,7 +142,9 @@ def test_a_held_argument_is_changed_in_place_and_not_copied_again(
 
 
 def elsewhere(cuda: FakeCuda, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Run a function on another stream than the current one, which a capture does not record."""
+    """Return a version of a function that runs on another stream than the current one, which a
+    capture does not record.
+    """
     side = torch.cuda.Stream()
 
     def run(x: Any) -> Any:
@@ -162,7 +166,7 @@ def compiles_to(
 def refused(
     cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch, mode: CompileMode, function: Callable[..., Any]
 ) -> str:
-    """Return the report of a mode whose last tier has this function in the place of the core."""
+    """Return the report of a mode whose last stage has this function in place of the core."""
     eager = (lambda x: x.tanh() + x) if mode == "require" else function
     compiles_to(monkeypatch, lambda _: function)
     with loading_report(lambda _: None) as report:
@@ -170,7 +174,7 @@ def refused(
     x = numbers(cuda)
     same(core(x), eager(x))
     assert len(report.uncompiled) == 3
-    # The graph of the eager core stays.
+    # The graph of the eager core remains.
     assert compilation.sizes == ([1, 2, 4] if mode == "require" else [])
     return report.uncompiled[0]
 
@@ -246,7 +250,7 @@ def test_what_torch_compiles_is_used_if_it_is_faster_by_three_percent(
     core, _ = compiled(cuda, doubled(eager))
     cuda.replays.clear()
     core(numbers(cuda))
-    assert [len(graph.calls) for graph in cuda.replays] == [used]  # operations
+    assert [len(graph.calls) for graph in cuda.replays] == [used]  # number of operations
 
 
 def test_the_graphs_of_a_policy_share_memory_and_the_largest_is_made_first(cuda: FakeCuda) -> None:
@@ -269,10 +273,11 @@ def test_the_graphs_of_a_policy_share_memory_and_the_largest_is_made_first(cuda:
     assert [len(graph.calls[0][1]) for graph in cuda.captures] == [4, 4, 2, 2]
     assert {graph.stream.priority for graph in cuda.captures} == {ACT_PRIORITY}
     assert cuda.reserved[0] == (4 + 2) * 3 * DIM * 4
-    assert compilation.graph_bytes > cuda.reserved[0], "the inputs take memory, too"
+    assert compilation.graph_bytes > cuda.reserved[0], "the inputs also take memory"
     compiled(cuda, torch.tanh)
     assert len({id(graph.pool) for graph in cuda.captures}) == 2
-    for rows in (1, 2, 3, 4, 2):  # each replay overwrites what all others left in the pool
+    # each replay overwrites the results of all other graphs in the pool
+    for rows in (1, 2, 3, 4, 2):
         x = numbers(cuda, rows)
         first, (second, third), again, _ = act(x)
         for got, wanted in ((first, x @ w), (second, x * 2), (third, x - 1), (again, x @ w)):
@@ -298,7 +303,7 @@ def test_constants_from_the_host_are_copied_before_the_capture(cuda: FakeCuda) -
 def test_only_a_core_with_constants_from_the_host_is_watched_while_it_is_captured(
     cuda: FakeCuda,
 ) -> None:
-    """Each operation takes longer while it is watched, and other policies wait for a capture."""
+    """Observing each operation slows down the capture, for which other policies wait."""
     modes: list[int] = []
 
     def without_constants(x: Any) -> Any:
@@ -319,8 +324,8 @@ def test_only_a_core_with_constants_from_the_host_is_watched_while_it_is_capture
 
 
 def test_casts_of_autocast_are_not_kept_beyond_it() -> None:
-    """The cache ends with the context, in which a graph was captured, but the graph reads the
-    memory further on.
+    """The cache ends with the context in which a graph was captured, but the graph still reads this
+    memory.
     """
     layer, cached = torch.nn.Linear(DIM, DIM), list[bool]()
 
@@ -351,7 +356,7 @@ class Passes(FlowPasses):
 
 
 def drawn(cuda: FakeCuda, rows: int) -> dict[str, Any]:
-    """Return the arguments of `sample`, of random values."""
+    """Return random arguments for `sample`."""
     return {
         "images": [],
         "cameras": [cuda.tensor(torch.ones(rows, dtype=torch.bool))],
@@ -418,16 +423,18 @@ def test_beside_acts_a_flow_is_captured_step_by_step_and_as_a_whole_later(
     step_by_step, whole = 1 + STEPS, 2
     assert [replays_of(rows) for rows in (1, 2, 4)] == [step_by_step] * 3
     captured = len(cuda.captures)
-    assert compilation.add_deferred(forward), "one size at a time, from the largest one"
+    assert compilation.add_deferred(forward), (
+        "sizes must be captured one at a time, from the largest"
+    )
     assert [replays_of(rows) for rows in (1, 2, 4)] == [step_by_step, whole, whole]
     assert not compilation.add_deferred(forward)
     assert [replays_of(rows) for rows in (1, 2, 4)] == [whole] * 3
-    assert len(cuda.captures) == captured + 2, "encode and the steps are not captured again"
+    assert len(cuda.captures) == captured + 2, "encode and the steps must not be captured again"
     assert compilation.sizes == [1, 4]
 
     compilation.add_size(2, partial(forward, 2), defers=True)
     compilation.drop_graphs()
-    assert not compilation.add_deferred(forward), "a policy that wakes makes all graphs"
+    assert not compilation.add_deferred(forward), "a policy that wakes must capture all graphs"
 
 
 def test_the_graph_of_a_flow_has_the_compiled_steps(
@@ -492,8 +499,8 @@ class Waiting(Agent):
 
 
 def captured_beside(cuda: FakeCuda, begin: Callable[[], queue.SimpleQueue[Any]]) -> Any:
-    """Capture a graph, begin something on another thread meanwhile, and return its result, which
-    comes afterwards.
+    """Capture a graph, begin something on another thread during the capture, and return its result,
+    which comes afterwards.
     """
     begun: list[queue.SimpleQueue[Any]] = []
 
@@ -573,7 +580,8 @@ def test_what_a_load_beside_acts_defers_is_loaded_when_no_request_comes(
 
         def load_deferred(self) -> bool:
             self.parts_left -= 1
-            # A push holds this lock when it waits for the model, so that it must be taken first.
+            # A push holds this lock when it waits for the model, so the lock must be acquired
+            # first.
             assert CAPTURES.pushes._is_owned()  # type: ignore[attr-defined]
             parts.put(torch.cuda.current_stream())
             return self.parts_left > 0
@@ -585,7 +593,7 @@ def test_what_a_load_beside_acts_defers_is_loaded_when_no_request_comes(
     try:
         submit(engine, "a", Request("reset", Obs(), kwargs={"checkpoint": "other"}), replies.put)
         assert replies.get(timeout=10).error is None
-        with engine.weights.acting_lock:  # as while a batch runs, or the policy sleeps
+        with engine.weights.acting_lock:  # like during a batch, or while the policy sleeps
             monkeypatch.setattr(model_manager, "QUIET_S", 0.05)
             with pytest.raises(queue.Empty):
                 parts.get(timeout=0.2)
@@ -596,14 +604,14 @@ def test_what_a_load_beside_acts_defers_is_loaded_when_no_request_comes(
         models = list(engine.models._cache.loaded.values())
         assert [model.deferred for model in models] == [None, None]
         assert sorted(model.agent.parts_left for model in models) == [0, 2], (  # type: ignore[attr-defined]
-            "the first model has deferred nothing"
+            "the first model must have nothing deferred"
         )
     finally:
         engine.close()
 
 
 class OnStreams(Waiting):
-    """Notes the stream of each of its calls."""
+    """A policy that records the stream of each of its calls."""
 
     shared: ClassVar[tuple[str, ...]] = ("streams",)
 
@@ -654,7 +662,7 @@ def test_all_calls_of_a_policy_are_on_one_stream_which_has_priority_over_pushes(
     assert agent.streams.keys() == {"reset", "prepare", "act"}
     assert {stream for streams in agent.streams.values() for stream in streams} == {acts._stream}
     assert acts._stream.priority < default.priority == 0
-    # Work of the policy outside of its calls is ordered with them.
+    # Work of the policy outside of its calls is ordered relative to them.
     assert default in acts._stream.waited_for
     assert acts._stream in default.waited_for
 
@@ -727,11 +735,11 @@ def test_a_capture_may_not_begin_within_an_act_of_its_thread(cuda: FakeCuda) -> 
 
 
 class OnGpu(ModelPolicy):
-    """A model on the fake GPU, whose actions are a linear layer of noise."""
+    """A model on the simulated GPU, whose actions are a linear layer of noise."""
 
     Config = ModelConfig
     cuda: ClassVar[FakeCuda]
-    kind = "cuda"  # as it reports
+    kind = "cuda"  # the reported kind
 
     @property
     def contract(self) -> Contract:
@@ -776,7 +784,7 @@ def test_a_model_that_sleeps_frees_its_graphs_and_weights_and_acts_the_same_when
     assert (len(cuda.captures), policy.compilation.sizes) == (2 * made, [1, 2])
     replayed = len(cuda.replays)
     np.testing.assert_array_equal(act(), first)
-    assert len(cuda.replays) == replayed + 1, "from a graph"
+    assert len(cuda.replays) == replayed + 1, "the result must come from a graph"
 
 
 def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fails(
@@ -830,7 +838,7 @@ class OnCpu(OnGpu):
 
 
 class WithoutCores(OnGpu):
-    """A model on the fake GPU that marks nothing."""
+    """A model on the simulated GPU without compiled cores."""
 
     def load(self) -> Any:
         loaded = super().load()

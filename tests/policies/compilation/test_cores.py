@@ -1,5 +1,5 @@
-"""Compiled cores: their results, when they are made, what happens to wrong ones, and where
-programs are kept.
+"""Compiled cores: their results, the time of compilation, wrong programs, and the cache of
+programs.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ WORDS = "go"
 
 
 class Linear(ModelPolicy):
-    """A chunk is a linear layer of the state, and of the session's noise."""
+    """A model whose chunk is a linear layer of the state and of the session's noise."""
 
     Config = ModelConfig
     trainable = "model"
-    refused = False  # of every observation
+    refused = False  # whether each observation is rejected
 
     @property
     def contract(self) -> Contract:
@@ -78,7 +78,7 @@ class Linear(ModelPolicy):
 
 
 class Breaking(Linear):
-    """A model that leaves the graph."""
+    """A model whose code breaks the graph."""
 
     def _layer(self, model: Any) -> Callable[..., Any]:
         layer = super()._layer(model)
@@ -131,12 +131,12 @@ def test_batches_of_any_size_act_as_without_compilation(compiler: CountingCompil
 
 
 def test_programs_are_made_once_while_the_policy_loads(compiler: CountingCompiler) -> None:
-    sizes = list(range(1, 13))  # more than torch allows for one function
+    sizes = list(range(1, 13))  # more sizes than torch allows for one function
     policy, report, steps = loaded(compile="require", batch_sizes=sizes)
     assert (compiler.rows, policy.compilation.sizes, report.uncompiled) == (sizes[::-1], sizes, [])
     assert steps == [f"compiling {size} rows ({13 - size} of 12)" for size in sizes[::-1]]
     acted(policy, range(5))
-    # The policy's thread is not always the loading one.
+    # The policy's thread may differ from the thread that loads it.
     other = threading.Thread(target=acted, args=(policy, range(7)))
     other.start()
     other.join()
@@ -240,15 +240,14 @@ def test_a_program_with_other_results_is_not_used(
 def test_a_program_that_keeps_an_input_of_its_first_call_is_not_used(
     monkeypatch: pytest.MonkeyPatch, kept: tuple[int, ...]
 ) -> None:
-    """As a CUDA graph does that missed a part: the values which that part had in the capture
-    stay.
-    """
+    """An incomplete CUDA graph behaves like this: it keeps some values from its capture."""
 
     def stale(graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
         first: list[Any] = []
 
         def program(*inputs: Any) -> Any:
-            # The model's weights are inputs, too; those of the core have as many rows as the batch.
+            # The model's weights are also inputs; the core's own inputs have as many rows as the
+            # batch.
             first.extend([] if first else [one.clone() for one in inputs])
             own = [i for i, one in enumerate(inputs) if not isinstance(one, torch.nn.Parameter)]
             for i in (own[place] for place in kept):
@@ -304,7 +303,7 @@ def test_an_action_while_another_model_is_built_makes_no_program(
 
 
 def test_each_comparison_has_inputs_of_its_own(compiler: CountingCompiler) -> None:
-    """A program that is right once, for the inputs after which it was made, is not used."""
+    """A program that is correct only for the inputs of its compilation is not used."""
     right = iter([True, True])  # the first call, and the first comparison
     compiler.change[2] = lambda out: out if next(right, False) else out + 1
     assert loaded(compile=True, batch_sizes=[2])[0].compilation.sizes == []
@@ -316,8 +315,8 @@ def test_the_rounding_of_a_program_is_accepted(compiler: CountingCompiler) -> No
 
 
 class Bfloat16Step:
-    """A step of a flow in bfloat16: it reads little of the state, and both cameras by the same
-    layers.
+    """A step of a flow in bfloat16. It reads little of the state, and processes both cameras with
+    the same layers.
     """
 
     def __init__(self, steps: int = 1, width: int = 64) -> None:
@@ -358,13 +357,13 @@ class Bfloat16Step:
 
 
 def merged(step: Bfloat16Step) -> Callable[..., Any]:
-    """Return the step as kernels that keep float32 between the operations."""
+    """Return the step like kernels that keep float32 between the operations."""
     layers = copy.deepcopy(step.layers).float()
     return lambda *inputs: step(*inputs, layers=layers, dtype=torch.float32)
 
 
 def sums_in_parts(step: Bfloat16Step) -> Callable[..., Any]:
-    """Return the step with sums in another order: of two parts, each of which is rounded."""
+    """Return the step with sums in another order: two parts, each of which is rounded."""
 
     def layer_of(layer: Any) -> Callable[[Any], Any]:
         halves = list(zip(layer.weight.chunk(2, 1), (0, 1), strict=True))
@@ -422,7 +421,7 @@ def test_only_programs_within_the_rounding_of_their_checkpoint_are_used(
 
 
 def test_the_rounding_of_autocast_is_measured_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Inputs and results in float32 do not show that the core computes in bfloat16."""
+    """Inputs and results in float32 hide that the core computes in bfloat16."""
     step = Bfloat16Step()
     layers = copy.deepcopy(step.layers).float()
 
@@ -443,7 +442,7 @@ def test_the_rounding_of_autocast_is_measured_too(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_measurement_of_rounding_draws_nothing(compiler: CountingCompiler) -> None:
-    """Policies draw from torch's generators, and act the same with any `compile`."""
+    """Policies draw from torch's generators, and must act the same with any `compile`."""
     compiler.change[2] = lambda out: out * 1.0015
     before = torch.get_rng_state()
     policy = Linear.from_config({"checkpoint": "none", "compile": True, "batch_sizes": [2]})
@@ -456,8 +455,8 @@ def test_a_measurement_of_rounding_draws_nothing(compiler: CountingCompiler) -> 
 
 
 class Candidates(Linear):
-    """A model that runs five rows for each of a batch, at most three at a time, as a planner
-    tries plans.
+    """A model that runs five rows for each row of a batch, at most three at a time, like a planner
+    that tries plans.
     """
 
     def load(self) -> Any:
@@ -512,7 +511,7 @@ LAYERS = 6
 
 
 class Layer(torch.nn.Module):
-    """A layer with weights of its own, like the others of its model."""
+    """A layer with its own weights, like the other layers of its model."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -549,7 +548,7 @@ def test_layers_share_the_program_of_their_region(
     torch.testing.assert_close(core(x), expected)
     assert compiler.calls - calls == (LAYERS if by_regions else 1)
     torch.testing.assert_close(model(x), expected)
-    assert compiler.calls - calls == (LAYERS if by_regions else 1)  # the model itself is eager
+    assert compiler.calls - calls == (LAYERS if by_regions else 1)  # the model itself stays eager
 
 
 def test_a_region_with_other_results_is_not_used(compiler: CountingCompiler) -> None:
@@ -596,8 +595,8 @@ TORCH = "TORCHINDUCTOR_CACHE_DIR"
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The user's cache, in which nothing is yet."""
-    # So that its old value comes back: torch and the tested function set it.
+    """Simulate an empty cache of the user."""
+    # So that monkeypatch restores the old value: torch and the tested function set it.
     monkeypatch.setenv(TORCH, "")
     monkeypatch.delenv(TORCH)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -624,7 +623,7 @@ def test_programs_are_kept_where_only_the_user_may_write(
 
 
 def test_programs_of_jax_for_a_cpu_are_not_kept(cache: Path) -> None:
-    """JAX 0.5.3 computes something else with one that it has read."""
+    """JAX 0.5.3 computes different results with a program that it has read from the cache."""
     keep_jax_programs(jax := jax_with(None), "cpu")
     assert jax.config.jax_compilation_cache_dir is None
     assert not cache.exists()
@@ -647,12 +646,13 @@ def test_a_cache_that_cannot_be_written_is_no_error(
     assert "compiled programs are not kept" in caplog.text
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.:DeprecationWarning")  # of torch's own compiler
+# a warning of torch's own compiler
+@pytest.mark.filterwarnings("ignore:`torch.jit.:DeprecationWarning")
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
 def test_a_program_is_compiled_once_and_found_at_the_next_start(cache: Path) -> None:
     def start() -> tuple[int, int]:
-        """Compile, as a new process would; returns how many programs were found, and how many
-        were not.
+        """Compile like a new process, and return how many programs were found in the cache and how
+        many were not.
         """
         torch._dynamo.reset()
         torch._dynamo.utils.counters.clear()

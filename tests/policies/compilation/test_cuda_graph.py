@@ -1,4 +1,4 @@
-"""CUDA graphs: their results, the memory of these, new weights, and other threads."""
+"""CUDA graphs: their results and the memory of these, new weights, and other threads."""
 
 from __future__ import annotations
 
