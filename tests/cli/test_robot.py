@@ -681,6 +681,49 @@ def test_the_keys_on_an_arm_are_named_at_the_start_and_end_and_label_the_run(
         assert labels(tmp_path / "demos") == [label]
 
 
+ON_AN_ARM_WITH_A_SLOW_ANSWER = ON_AN_ARM.replace(
+    "class Arm:",
+    """
+import time
+
+class Slow(Still):
+    answers = 0
+
+    def act(self, obs):
+        Slow.answers += 1
+        if Slow.answers == 3:
+            time.sleep(1.0)
+        return super().act(obs)
+
+class Arm:""",
+).replace("command.RemoteAgent = Still", "command.RemoteAgent = Slow")
+
+
+@pytest.mark.parametrize("restart", ["auto", "manual", "signal"])
+def test_after_a_stop_the_command_says_once_that_the_server_answers_and_the_robot_continues(
+    restart: str,
+) -> None:
+    mode = "auto" if restart == "auto" else "manual"
+    words = ["--silent-s", "0.3", "--restart", mode, "--teleop", "arm:Leader"]
+    with at_a_terminal(ON_AN_ARM_WITH_A_SLOW_ANSWER, *words) as (process, press, lines):
+        until(lines, "stopped by the watchdog: server: silent for")
+        if restart == "auto":
+            until(lines, "the server answers again: the robot continues")
+        else:
+            until(lines, "the server answers again: Enter or C restarts the robot")
+            if restart == "manual":
+                press("\n")
+            else:
+                process.send_signal(signal.SIGUSR1)
+            until(lines, "restarted")
+        press("q")
+        said = "\n".join(lines)
+        process.wait(30)
+    assert "Traceback" not in said
+    assert "answers again" not in said
+    assert "restarted" not in said
+
+
 def test_without_a_terminal_the_command_says_so() -> None:
     run = subprocess.run(
         [sys.executable, "-c", ON_AN_ARM, "--seconds", "0.2"],

@@ -106,3 +106,29 @@ def test_a_stop_hook_that_fails_does_not_end_the_watch() -> None:
         watchdog.heard("server")
         calls.get(timeout=BARK_S)
     assert isinstance(watchdog.error, OSError)
+
+
+def test_the_end_of_a_silence_is_reported_once_and_only_after_a_stop() -> None:
+    barks, ended = Barks(), Barks()
+    with Watchdog(barks, {"server": 0.1}, ended) as watchdog:
+        for _ in range(2):
+            watchdog.heard("server")
+            assert ended.heard.empty()
+            assert barks.next() == "server"
+            for _ in range(3):
+                watchdog.heard("server")
+            assert ended.next() == "server"
+        assert not watchdog.error
+
+
+def test_an_error_of_what_is_called_after_a_silence_does_not_end_the_watchdog() -> None:
+    def broken(source: str) -> None:
+        raise OSError(source)
+
+    barks = Barks()
+    with Watchdog(barks, {"server": 0.05}, broken) as watchdog:
+        for _ in range(2):
+            assert barks.next() == "server"
+            watchdog.heard("server")
+        barks.next()
+        assert isinstance(watchdog.error, OSError)

@@ -121,6 +121,12 @@ class RobotControl:
         with self._lock:
             return sorted(self._silent)
 
+    @property
+    def needs_restart(self) -> bool:
+        """Whether the robot is stopped until `restart`, even if no source is silent."""
+        with self._lock:
+            return self._stop is not None or (self._barked and not self._auto)
+
     def pause(self, reason: str = PAUSED) -> None:
         """Hold the robot still until `resume` or a takeover.
 

@@ -257,22 +257,14 @@ def _run(options: argparse.Namespace, end_signal: _EndSignal) -> LoopReport:
         if options.rerun is not None:
             viewer = stack.enter_context(open_viewer(options.rerun))
 
-        def stop(reason: str) -> None:
-            """Stop the robot, and print the reason."""
-            robot.stop()
-            say(f"stopped by the watchdog: {reason}")
-
         hanging_s = max(0.2, 5 / hz) + deadline_s
-        watchdog = robot_watchdog(robot, stop, {"server": options.silent_s, "loop": hanging_s})
+        limits_s = {"server": options.silent_s, "loop": hanging_s}
         keys = _RunKeys(recorder, say)
-        has_terminal = stack.enter_context(_restarting(watchdog, say, keys.press))
-        if has_terminal:
-            say(KEYS)
-        else:
-            say("no keys, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it")
+        watchdog = stack.enter_context(_watched(robot, limits_s, keys, say))
 
         def is_over() -> bool:
             end_signal.raise_if_received()
+            keys.say_restart()
             return keys.over or _is_task_done(robot)
 
         loop_options = LoopOptions(
@@ -313,6 +305,32 @@ def _run(options: argparse.Namespace, end_signal: _EndSignal) -> LoopReport:
     if failure is not None:
         raise failure
     return report
+
+
+@contextlib.contextmanager
+def _watched(
+    robot: Robot, limits_s: dict[str, float], keys: _RunKeys, say: Callable[[str], None]
+) -> Iterator[Watchdog]:
+    """Make the robot's watchdog, not yet started, which prints stops and the end of silences.
+    Within the context, the operator can restart the robot and use the keys.
+    """
+
+    def stop(reason: str) -> None:
+        """Stop the robot, and print the reason."""
+        robot.stop()
+        say(f"stopped by the watchdog: {reason}")
+
+    def silence_ended(source: str) -> None:
+        """Print that a source gives signs of life again, and how the robot continues."""
+        say(_after_silence(source, watchdog.control, has_terminal=has_terminal))
+
+    watchdog = robot_watchdog(robot, stop, limits_s, silence_ended)
+    with _restarting(watchdog, say, keys.press, keys.restart_signal) as has_terminal:
+        if has_terminal:
+            say(KEYS)
+        else:
+            say("no keys, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it")
+        yield watchdog
 
 
 @contextlib.contextmanager
@@ -527,6 +545,20 @@ def _say_timeliness(report: LoopReport, say: Callable[[str], None]) -> None:
         say(f"the server foresaw that this robot is not served in time: {report.slo['reason']}")
 
 
+def _after_silence(source: str, control: RobotControl, *, has_terminal: bool) -> str:
+    """Return a line for the operator about a source that gives signs of life again."""
+    if control.silent:
+        outcome = f"still no signal from the {' and the '.join(control.silent)}"
+    elif not control.needs_restart:
+        outcome = "the robot continues"
+    elif has_terminal:
+        outcome = "Enter or C restarts the robot"
+    else:
+        outcome = "SIGUSR1 restarts the robot"
+    news = "the server answers" if source == "server" else f"signals from the {source}"
+    return f"{news} again: {outcome}"
+
+
 class _RunKeys:
     """Handles the operator's keys at the terminal during a run on a robot. A key that ends the run
     also stops the robot.
@@ -534,8 +566,20 @@ class _RunKeys:
 
     def __init__(self, recorder: Recorder | None, say: Callable[[str], None]) -> None:
         self.over = False  # whether the operator ended the run
+        # What a signal to restart motion has done, until it is printed.
+        self._restart_outcome: str | None = None
         self._recorder = recorder
         self._say = say
+
+    def restart_signal(self, outcome: str) -> None:
+        """Receive the outcome of a signal to restart motion; a signal handler must not print."""
+        self._restart_outcome = outcome
+
+    def say_restart(self) -> None:
+        """Print the outcome of a signal to restart motion, if there was one."""
+        outcome, self._restart_outcome = self._restart_outcome, None
+        if outcome is not None:
+            self._say(outcome)
 
     def press(self, key: str, control: RobotControl) -> bool:
         """Handle a key; return whether the key is known."""
@@ -562,36 +606,39 @@ def _restarting(
     watchdog: Watchdog,
     say: Callable[[str], None],
     press: Callable[[str, RobotControl], bool] = lambda *_: False,
+    restart_signal: Callable[[str], None] = lambda _: None,
 ) -> Iterator[bool]:
     """Let the operator restart motion after a stop or a pause: with Enter or C at the terminal, or
     with SIGUSR1.
 
-    Other keys are passed to `press`. Yields whether there is a terminal.
+    Other keys are passed to `press`. The outcome of the signal, as text, is passed to
+    `restart_signal` in the signal handler. Yields whether there is a terminal.
     """
 
-    def restart() -> bool:
-        """Restart motion; return False if a source of the watchdog is still silent."""
+    def restart() -> str:
+        """Restart motion, unless a source of the watchdog is still silent; return the outcome, ""
+        if the robot was not at rest.
+        """
+        control = watchdog.control
+        was_standing = control.stopped or control.reason is not None
         if not watchdog.restart():
-            return False
-        watchdog.control.resume()
-        return True
+            return f"not restarted: still no signal from the {' and the '.join(control.silent)}"
+        control.resume()
+        return "restarted" if was_standing else ""
 
     def handle_key(key: str) -> bool:
         """Handle a key of the terminal; return whether the key is known."""
         if key not in RESTART_KEYS:
             return press(key, watchdog.control)
-        was_standing = watchdog.control.stopped or watchdog.control.reason is not None
-        if not restart():
-            say(
-                "not restarted: still no signal from the "
-                f"{' and the '.join(watchdog.control.silent)}"
-            )
-        elif was_standing:
-            say("restarted")
+        outcome = restart()
+        if outcome:
+            say(outcome)
         return True
 
     def handle_signal(*_: object) -> None:
-        restart()
+        outcome = restart()
+        if outcome:
+            restart_signal(outcome)
 
     with contextlib.ExitStack() as undo:
         has_terminal = undo.enter_context(typed_keys(handle_key))

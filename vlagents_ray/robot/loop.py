@@ -161,7 +161,10 @@ def fit_of(
 
 
 def robot_watchdog(
-    robot: Robot, stop: Callable[[str], None], silent_s: dict[str, float]
+    robot: Robot,
+    stop: Callable[[str], None],
+    silent_s: dict[str, float],
+    silence_ended: Callable[[str], None] | None = None,
 ) -> Watchdog:
     """Return a watchdog that also watches the robot's own sources.
 
@@ -171,12 +174,13 @@ def robot_watchdog(
             the robot can record signs of life of these sources.
         stop: Stops the robot; its argument is the reason (see `Watchdog`).
         silent_s: The longest silence of each source by name, s.
+        silence_ended: Called with a source that gives signs of life again (see `Watchdog`).
 
     Returns:
         The watchdog, not yet started.
     """
     limits_s = {**getattr(robot, "silent_s", {}), **silent_s}
-    watchdog = Watchdog(stop, limits_s)
+    watchdog = Watchdog(stop, limits_s, silence_ended)
     if hasattr(robot, "watchdog"):
         robot.watchdog = watchdog
     return watchdog

@@ -26,12 +26,19 @@ class Watchdog:
         stop: Stops the robot; its argument is the reason as text, which is also appended to
             `barks`.
         silent_s: The longest silence of each source by name, s.
+        silence_ended: Called on the watchdog's own thread with the name of a source whose silence
+            stopped the robot, when the source gives signs of life again.
 
     Raises:
         ConfigError: A time limit is not above 0.
     """
 
-    def __init__(self, stop: Callable[[str], None], silent_s: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        stop: Callable[[str], None],
+        silent_s: Mapping[str, float],
+        silence_ended: Callable[[str], None] | None = None,
+    ) -> None:
         for name, limit_s in silent_s.items():
             if not limit_s > 0:
                 raise ConfigError(f"watchdog: {name!r}: expected a limit above 0 s, got {limit_s}")
@@ -40,6 +47,9 @@ class Watchdog:
         self.control = RobotControl()
         """The state of the robot; in `run_loop`, the watchdog and a chunk player share it."""
         self._stop = stop
+        self._silence_ended = silence_ended
+        # Sources whose silence has ended, for the calls of `silence_ended`.
+        self._heard_again: list[str] = []
         self._limits = dict(silent_s)  # s
         # Time of each source's last sign of life, time.monotonic().
         self._heard_at = dict.fromkeys(silent_s, 0.0)
@@ -69,6 +79,7 @@ class Watchdog:
             self._heard_at[name] = heard_at
             if name in self.control.silent and ago_s < self._limits[name]:
                 self.control.heard(name)
+                self._heard_again.append(name)
                 self._changed.notify_all()
 
     def share(self, control: RobotControl) -> None:
@@ -167,10 +178,23 @@ class Watchdog:
         while True:
             with self._changed:
                 reason = None
-                while reason is None:
+                while reason is None and not self._heard_again:
                     if self._thread is not me:
                         return
                     reason, wait_s = self.overdue()
                     if reason is None:
                         self._changed.wait(wait_s)
-            self.bark(reason)
+                sources, self._heard_again = self._heard_again, []
+            if reason is not None:
+                self.bark(reason)
+            for source in sources:
+                self._report_end(source)
+
+    def _report_end(self, source: str) -> None:
+        """Report the end of a silence, and store an error of the function that receives it."""
+        if self._silence_ended is None:
+            return
+        try:
+            self._silence_ended(source)
+        except Exception as error:  # noqa: BLE001 - the watchdog must continue
+            self.error = error
