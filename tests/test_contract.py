@@ -1,4 +1,4 @@
-"""Contracts: every difference is named with its cure, and nothing unstated is compared."""
+"""Contracts: each difference is reported with its cure, and undeclared fields are not compared."""
 
 from __future__ import annotations
 
@@ -123,13 +123,11 @@ def test_the_order_of_the_arms_survives_json_and_is_compared() -> None:
 def test_joints_in_another_order_are_found_by_the_names_that_both_sides_have() -> None:
     env = Contract(action=ActionSpec(names=("left_pan", "left_lift", "left_grip", "right_pan")))
     assert Contract.from_json(json.loads(json.dumps(env.to_json()))) == env
-    assert "names" not in Contract().to_json()["action"], (
-        "older versions refuse what they do not know"
-    )
+    assert "names" not in Contract().to_json()["action"], "older versions reject unknown fields"
     same = Contract(action=ActionSpec(names=("left_pan.pos", "left_lift.pos", "right_pan.pos")))
     assert differences(same, env) == []
     assert differences(Contract(action=ActionSpec(names=("joint1", "joint2"))), env) == [], (
-        "other names say nothing"
+        "other names must have no effect"
     )
     found = differences(
         Contract(action=ActionSpec(names=("left_lift", "left_pan", "right_pan"))), env
@@ -290,7 +288,7 @@ def test_no_numpy_is_left_in_the_json_of_a_contract() -> None:
 
 
 class TestAPolicyOfSeveralPartsServedAsOne:
-    """`state` unset, so that one part stands for all numbers that the policy was trained with."""
+    """`state` is not set, so one part contains all numbers with which the policy was trained."""
 
     ENV = Contract(
         state={

@@ -1,4 +1,4 @@
-"""What a dataset says to the policy that is trained on it, and angles that do not jump."""
+"""The contract between a dataset and the policy trained on it, and continuous angles."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_what_is_no_contract_is_an_error_with_the_cure(text: str) -> None:
 
 
 def test_averages_of_the_same_contract_are_it_and_of_two_are_an_error() -> None:
-    """So does LeRobot merge datasets, and leave out episodes."""
+    """LeRobot merges datasets and leaves out episodes in the same way."""
     other = replace(ABOUT, angles={**ABOUT.angles, 3: 2.9})
     first, same, changed = (
         {
@@ -100,14 +100,14 @@ def test_of_an_angle_whose_range_is_known_the_middle_is_the_centre_and_nothing_i
     inside = np.linspace(-4.0, -2.0, 50, dtype=np.float32)[:, None]
     np.testing.assert_array_equal(about.wrapped(inside), inside)
     assert about.wrapped(np.array([2.5], np.float32))[0] == pytest.approx(2.5 - 2 * math.pi)
-    assert centre_between(-3.0, 3.0) is None, "it is on the circle"
-    assert centre_between(-9.0, 9.0) is None, "it counts turns"
+    assert centre_between(-3.0, 3.0) is None, "the value is on the circle"
+    assert centre_between(-9.0, 9.0) is None, "the value counts turns"
 
 
 def test_angles_are_known_by_their_units() -> None:
     assert list(angles_in("joints", "rad", 2)) == [0, 1]
     assert list(angles_in("xyzrpy", "m+rad", 6)) == [3, 4, 5]
-    # A rotation vector's numbers do not turn one by one.
+    # The numbers of a rotation vector do not wrap individually.
     assert not angles_in("xyz_axis_angle", "m+rad", 6)
     assert rotation_vector_in("xyz_axis_angle", "m+rad", 6) == 3
     assert not angles_in("axis_angle", "rad", 3)
@@ -122,7 +122,7 @@ def test_angles_are_known_by_their_units() -> None:
 
 
 def test_an_angle_that_jumps_is_continuous_about_its_centre() -> None:
-    turned = np.linspace(2.5, 4.5, 50)  # over pi
+    turned = np.linspace(2.5, 4.5, 50)  # past pi
     seen = np.angle(np.exp(1j * turned))
     centre = centre_of([seen[:30], seen[30:]])
     assert centre is not None
@@ -130,7 +130,7 @@ def test_an_angle_that_jumps_is_continuous_about_its_centre() -> None:
         seen[:, None].astype(np.float32)
     )[:, 0]
     assert np.abs(np.diff(values)).max() < 0.1
-    assert np.abs(values - centre).max() < 1.1, "the cut is opposite to what was seen"
+    assert np.abs(values - centre).max() < 1.1, "the cut must be opposite to the observed values"
 
 
 def test_one_that_jumps_only_from_episode_to_episode_is_wrapped_too() -> None:
@@ -160,13 +160,15 @@ def test_wrapping_turns_by_whole_turns_into_the_circle_and_twice_is_once(centre:
     np.testing.assert_array_equal(values[:, 0], seen[:, 0])
     assert (np.abs(values[:, 1] - centre) <= math.pi + 1e-5).all()
     np.testing.assert_allclose(np.exp(1j * values[:, 1]), np.exp(1j * seen[:, 1]), atol=1e-5)
-    # Of the cut itself either side is right.
+    # At the cut itself both sides are correct.
     near = np.abs(np.abs(values[:, 1] - centre) - math.pi) > 1e-4
     np.testing.assert_array_equal(about.wrapped(values)[near], values[near])
 
 
 def turning(axis: list[float], start: float, end: float) -> np.ndarray:
-    """Rotation vectors at most pi long, (60, 3), of a turn about an axis that changes, too."""
+    """Return rotation vectors at most pi long, (60, 3), of a turn about an axis that also
+    changes.
+    """
     axes = np.array(axis) + np.linspace([0, 0, 0], [0.2, -0.3, 0.1], 60)
     turned = (
         np.linspace(start, end, 60)[:, None] * axes / np.linalg.norm(axes, axis=1, keepdims=True)
@@ -192,7 +194,7 @@ def test_a_rotation_vector_that_passes_pi_is_continuous_and_the_same_rotation(
         Rotation.from_rotvec(vectors).as_matrix() for vectors in (values[:, 1:], seen)
     )
     np.testing.assert_allclose(rotations, expected, atol=1e-5)
-    for one, alone in zip(state, values, strict=True):  # as a server gets them, one by one
+    for one, alone in zip(state, values, strict=True):  # one by one, like a server receives them
         np.testing.assert_array_equal(
             DatasetContract(Contract(), angles={1: centre}).wrapped(one), alone
         )
@@ -211,7 +213,7 @@ def test_a_rotation_vector_near_no_rotation_that_counts_a_turn_is_near_zero() ->
 def test_rotation_vectors_without_jumps_and_those_that_count_turns_stay_as_they_are() -> None:
     assert rotation_centre_of([turning([1, 0, 0], 0.5, 2.5)]) is None
     assert rotation_centre_of([np.linspace([2.0, 0, 0], [4.5, 0, 0], 60)]) is None, (
-        "as robosuite's, up to two pi"
+        "angles may be up to two pi, like robosuite's"
     )
     assert rotation_centre_of([np.array([[7.0, 0, 0], [0, 0, 0]])]) is None
     assert rotation_centre_of([np.zeros((0, 3))]) is None

@@ -1,4 +1,6 @@
-"""The recorded session of the docs: its data are what the policy does, and its page runs them."""
+"""The recorded session of the docs: its data match the policy's actions, and its page
+replays them.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ play: Callable[[Agent, str, int], dict[str, Any]] = RECORDER["play"]
 
 
 class Recorded(Agent):
-    """Returns the chunks of an episode again, with their times."""
+    """A policy that returns the chunks of a recorded episode again, with their timings."""
 
     def __init__(self, episode: dict[str, Any]) -> None:
         self._acts = iter(episode["acts"])
@@ -67,8 +69,8 @@ def test_the_policy_plays_an_episode_again() -> None:
     agent.initialize()
     again = play(agent, episode["task"], episode["seed"])
     assert again["solved"] == episode["solved"]
-    # Equal to the bit on the recording's kind of processor; others round the network's sums in
-    # another order.
+    # Bit-identical on the recording's kind of processor; other processors sum in another order,
+    # which rounds differently.
     np.testing.assert_allclose(again["states"], episode["states"], atol=1e-3)
 
 
@@ -79,7 +81,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 
 def step(page: Page) -> int:
-    """The step that the page shows."""
+    """Return the step that the page shows."""
     return int(page.value("document.getElementById('scrub').value"))
 
 

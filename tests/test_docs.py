@@ -1,4 +1,4 @@
-"""What the pages under docs/ tell people to write is accepted."""
+"""The commands, options, keys and files in the pages under docs/ are valid."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ EXPLAINED = {
     "slurm.md": ["serve"],
     "troubleshooting.md": ["eval", "serve"],
 }
-# Options of sbatch, docker, ray, uv, of LeRobot's and GR00T's programs, and of the checkout's
+# Options of sbatch, docker, ray and uv, of LeRobot's and GR00T's programs, and of the checkout's
 # scripts.
 OF_OTHERS = {
     *(
@@ -149,8 +149,8 @@ OF_OTHERS = {
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_an_option_in_a_sentence_is_one_of_a_command_that_the_page_names(page: Path) -> None:
-    """`--only` in the text of `open-loop`, whose option is `--episodes`, would send readers to an
-    error.
+    """For example, `--only` in the text about `open-loop`, whose option is `--episodes`, would lead
+    readers to an error.
     """
     explained = [f"vlagents-ray {command}" for command in EXPLAINED.get(page.name, [])]
     assert unknown_options(page.read_text(), explained) == []
@@ -162,7 +162,9 @@ def test_an_option_that_no_command_of_its_page_has_is_found() -> None:
 
 
 def unknown_options(text: str, explained: Sequence[str] = ()) -> list[str]:
-    """Return the options in sentences that no command on the page has, nor one of `explained`."""
+    """Return the options in sentences that no command on the page has, and that are not in
+    `explained`.
+    """
     named = [*explained, *(line for line, _ in commands(text))]
     prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
     mentioned = [" ".join(code.split()) for code in re.findall(r"`([^`]*)`", prose)]
@@ -186,7 +188,7 @@ def keys_by_section() -> dict[str, set[str]]:
 
 
 KEYS = keys_by_section()
-NO_KEYS = {"checkpoints.swap"}  # in the statistics of a server
+NO_KEYS = {"checkpoints.swap"}  # keys in the statistics of a server
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -332,7 +334,7 @@ def test_the_figures_of_the_readme_are_the_measured_ones() -> None:
             assert f"{float(measured[name]):.{len(figure.partition('.')[2])}f}" == figure, shown
 
 
-# Rows of docs/alternatives.md, and those of docs/measured_tables.md that they quote.
+# Rows of docs/alternatives.md, and the rows of docs/measured_tables.md that they quote.
 _ALTERNATIVES = {
     "this server, shared memory": "shm",
     "this server, WebSocket": "websocket, default",
@@ -392,7 +394,7 @@ def test_what_a_page_links_to_exists(page: Path) -> None:
 
 
 def _anchors(page: Path) -> set[str]:
-    """Return the anchors of a page's headings, as the site and forges make them."""
+    """Return the anchors of a page's headings in the form of the site and of code hosts."""
     prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     headings = re.findall(r"^#+ (.+)$", prose, re.MULTILINE)
     plain = [re.sub(r"\[(.+?)\]\(.*?\)", r"\1", heading) for heading in headings]

@@ -1,6 +1,4 @@
-"""The files of runs that come with the package are accepted, and the page about them names every
-key.
-"""
+"""The run files in the package are valid, and the page about them lists all keys."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ from vlagents_ray.serve.launch.deployment_file import read_deployment
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "examples" / "evaluations").glob("*.yaml"))
 CAMERAS = {"libero": {"front", "wrist"}, "simpler": {"3rd_view_camera"}, "tabletop": {"front"}}
-# Of models that are not told which camera is which.
+# Models that do not need to know which camera is which.
 WITHOUT_WORDS = {
     "openpi": {"image": "front", "wrist_image": "wrist"},
     "openvla": {"image": "front"},

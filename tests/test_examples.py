@@ -1,4 +1,4 @@
-"""The examples work that need no server; those that do are run by test_served_pages.py."""
+"""The examples without a server work. Examples with a server are run by test_served_pages.py."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FILES = sorted(path for path in EXAMPLES.iterdir() if path.suffix in (".py", ".s
 
 @pytest.fixture
 def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the folder, in which a script finds those beside it."""
+    """Return a copy of the folder, in which a script can import the files next to it."""
     folder = tmp_path / "examples"
     shutil.copytree(EXAMPLES, folder, ignore=shutil.ignore_patterns("runs"))
     monkeypatch.chdir(folder)
@@ -33,7 +33,7 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def said(
     name: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> str:
-    """What a script prints."""
+    """Return the output of a script."""
     monkeypatch.setattr(sys, "argv", [name])
     before = set(sys.modules)
     try:
@@ -41,7 +41,7 @@ def said(
     finally:
         for module in set(sys.modules) - before:
             if Path(getattr(sys.modules[module], "__file__", None) or "/").parent == folder:
-                del sys.modules[module]  # the next test has a separate copy
+                del sys.modules[module]  # the next test imports a separate copy
     return capsys.readouterr().out
 
 

@@ -1,5 +1,5 @@
 """`make demo` and `make setup` on machines with and without a GPU, and without PyTorch's own
-index.
+package index.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ pytestmark = [
     pytest.mark.skipif(Path("/dev/nvidia0").exists(), reason="the machine has an NVIDIA GPU"),
 ]
 
-# Of an environment: pip resolves what a test sets, and all programs write down how they are called.
+# Programs of an environment: pip resolves the packages that a test sets, and all programs record
+# their calls.
 PROGRAMS = {
     "python": """
         case "$*" in
@@ -38,7 +39,7 @@ PROGRAMS = {
 
 
 class Machine:
-    """A machine on which pip resolves torch to some packages."""
+    """A machine on which pip resolves torch to given packages."""
 
     def __init__(
         self, folder: Path, packages: Sequence[str], *, gpu: bool = False, reachable: bool = True
@@ -142,7 +143,7 @@ def test_without_the_index_it_stops_with_a_cure_for_the_command_that_was_typed(
     machine = Machine(tmp_path, CUDA_BUILD, reachable=False)
     made = machine.make(goal)
     assert made.returncode != 0
-    assert PIP not in machine.installs_of_torch(), "it would download several GB"
+    assert PIP not in machine.installs_of_torch(), "the command would download several GB"
     assert not machine.ran("vlagents-ray")
     assert "Failed to fetch the index" in made.stderr
     assert f"{goal}: stopped before downloading several GB" in made.stderr

@@ -1,4 +1,4 @@
-"""Each figure in the docs that was measured on a GPU names its card, its date and its commit."""
+"""Each figure in the docs that was measured on a GPU has its card, its date and its commit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
-# On this page, each figure counts as measured on a GPU, even where no card is named.
+# On this page, each figure counts as measured on a GPU, even if no card is named.
 GPU_PAGE = DOCS / "gpu.md"
 
 CARD = re.compile(r"\b(?:A100|H100|H200|B200|L4|L40S?|RTX \w+)\b")
@@ -20,17 +20,17 @@ FIGURE = re.compile(r"\d (?:ms|s|GB|MiB|GB/s|TFLOP/s|W|J|MHz|times)\b")
 UNIT_OF_COLUMN = re.compile(
     r"\| (?:[^|\n]* )?(?:ms|s|GB|MiB|W|J per call|MHz|actions per second)(?: [^|\n]*)? \|"
 )
-# Figures that no GPU gave.
+# Phrases for figures that were not measured on a GPU.
 OTHER = re.compile(r"\*\*(?:computed|counted)\*\*|\bas computed\b|\bon a CPU\b|\bCPU time\b")
-# To the page with the card, the date and the commit.
+# Links to the page with the card, the date and the commit.
 LINK = re.compile(r"\]\((?:\.\./|docs/)*measured_gpu\.md\)")
-# Durations and sizes that no run gave.
+# Durations and sizes that were not measured.
 GIVEN = ("when no request has come for 5 s", "at 80 GB that is about")
 
 
 def passages(text: str) -> list[str]:
-    """Divide a text into paragraphs, each with the list, the table or the code that it
-    introduces, and each table with the paragraph below that says where it comes from.
+    """Divide a text into paragraphs. A paragraph includes the list, table or code that it
+    introduces, and a table includes the paragraph below it that names its origin.
     """
     paragraphs = re.split(r"\n\s*\n", re.sub(r"^<!-- /?gpu -->$", "", text, flags=re.MULTILINE))
     joined: list[str] = []
@@ -50,7 +50,7 @@ def has_figure(passage: str) -> bool:
 
 
 def lacks_origin(passage: str, *, is_of_gpu: bool) -> bool:
-    """Return whether a passage has a figure of a GPU whose origin it does not state.
+    """Return whether a passage has a figure of a GPU without its origin.
 
     Args:
         passage: The passage.

@@ -1,4 +1,4 @@
-"""The wheel holds the whole package, and it works with nothing but the light dependencies."""
+"""The wheel contains the whole package, and works with only the light dependencies."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ pytestmark = pytest.mark.slow
 
 
 def pip(*arguments: str) -> str:
-    """Our own pip, also for other environments (`--python`): they need none then."""
+    """Return this environment's pip, which can install into other environments (`--python`) that
+    have none.
+    """
     command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
     if done.returncode != 0:
@@ -35,7 +37,7 @@ def pip(*arguments: str) -> str:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built from a copy, as building writes into the source tree."""
+    """Build the wheel from a copy, since building writes into the source tree."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
@@ -57,7 +59,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def robot(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The Python of an empty environment into which only the wheel was installed."""
+    """Return the Python of an empty environment into which only the wheel was installed."""
     home = tmp_path_factory.mktemp("robot")
     venv.create(home, with_pip=False, symlinks=True)
     python = home / "bin" / "python"
@@ -157,15 +159,15 @@ def test_a_robot_has_the_command_that_drives_it(robot: Path) -> None:
 
 
 def test_the_import_takes_half_a_second_at_the_most(robot: Path) -> None:
-    # The interpreter's start.
+    # Without the interpreter's start.
     code = "import time, vlagents_ray, vlagents_ray.robot; print(time.process_time())"
-    # Beside others that want the caches, it takes longer.
+    # Next to other processes that compete for the caches, the import takes longer.
     assert any(float(run(robot, code)) < 0.5 for _ in range(10))
 
 
 @pytest.fixture(scope="module")
 def url() -> Iterator[str]:
-    """A server of this checkout, without Ray."""
+    """Run a server of this checkout without Ray, and yield its URL."""
     command = [sys.executable, str(ROOT / "tests/support/noop_http_server.py"), "127.0.0.1"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:

@@ -1,4 +1,4 @@
-"""The layout that ARCHITECTURE.md describes, as far as import-linter does not hold it."""
+"""The parts of the layout in ARCHITECTURE.md that import-linter does not check."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ FILES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
     for path in PACKAGE.rglob("*.py")
 }
-# As `ray._raylet`, `ray.serve._private.api`, or a name with an underscore that is imported from
-# Ray.
+# Private names such as `ray._raylet`, `ray.serve._private.api`, or a name with an underscore that
+# is imported from Ray.
 _PRIVATE = re.compile(r"\bray(\.\w+)*\._\w|^\s*from ray\S* import .*\b_\w", re.MULTILINE)
 
 
@@ -30,9 +30,7 @@ def tree(module: str) -> ast.Module:
 
 
 def statements(node: ast.AST) -> Iterator[ast.AST]:
-    """The statements below a node; the expressions in them, which are most of a tree, are left
-    out.
-    """
+    """Yield the statements below a node, without expressions, which are most of a tree."""
     for name in ("body", "orelse", "finalbody", "handlers", "cases"):
         below = getattr(node, name, None)
         for one in below if isinstance(below, list) else ():
@@ -41,8 +39,8 @@ def statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def imports(module: str) -> Iterator[str]:
-    """The modules that one imports, those included that only a type checker, or a function,
-    does.
+    """Yield the modules that a module imports, including imports for type checkers and in
+    functions.
     """
     for node in statements(tree(module)):
         if isinstance(node, ast.ImportFrom) and node.module is not None:
@@ -54,7 +52,7 @@ def imports(module: str) -> Iterator[str]:
 
 
 def circles(edges: dict[str, set[str]]) -> list[set[str]]:
-    """The groups in which each is reached from each."""
+    """Return the groups of modules that import each other, directly or indirectly."""
     reached = {start: _reached(start, edges) for start in edges}
     groups = {
         frozenset(other for other in reached[one] if one in reached.get(other, ())) for one in edges
@@ -112,7 +110,9 @@ def test_a_plugins_distribution_has_the_name_of_its_package() -> None:
 
 
 def test_each_list_of_plugins_has_all_of_them() -> None:
-    """A plug-in that is missing in one is neither installed, checked nor kept out of the core."""
+    """A plug-in that is missing in a list would not be installed, checked, or kept out of
+    the core.
+    """
     tools = PYPROJECT["tool"]
     extra = PYPROJECT["project"]["optional-dependencies"]["all"]
     assert {Requirement(text).name for text in extra} == {"vlagents-ray", *DISTRIBUTIONS}
@@ -147,7 +147,8 @@ def test_a_plugins_readme_links_to_pages_that_exist(name: str) -> None:
     assert [page for page in pages if not (folder / page).exists()] == []
 
 
-# Files and folders of tests/ that import plug-ins, with the reason. All others need the core alone.
+# Files and folders of tests/ that import plug-ins, with the reason. All other tests need only the
+# core.
 ABOVE_PLUGINS = {
     "benchmarks": "benchmarks measure plug-ins as well",
     "cluster/test_scaling.py": "it runs several drivers with the processes of the tuner",
@@ -198,4 +199,6 @@ def test_tests_of_the_core_import_no_plugin_but_those_of_the_workspace() -> None
         if path == exception or path.startswith(f"{exception}/")
     }
     assert sorted(importing - excepted.keys()) == [], "move it to the tests of that plug-in"
-    assert sorted(ABOVE_PLUGINS.keys() - set(excepted.values())) == [], "imports none any more"
+    assert sorted(ABOVE_PLUGINS.keys() - set(excepted.values())) == [], (
+        "does not import a plug-in any more"
+    )

@@ -1,4 +1,6 @@
-"""A robot's control computer installs three light packages; what it imports must need no more."""
+"""A robot's control computer installs three light packages, and the package's imports must need no
+more.
+"""
 
 from __future__ import annotations
 
@@ -49,13 +51,15 @@ TIMES_NUMPY = 4  # how much longer than numpy, which it imports, the package may
 
 
 def loaded_by(statement: str) -> set[str]:
-    """Top-level packages in a fresh interpreter's `sys.modules` after `statement`."""
+    """Return the top-level packages in a fresh interpreter's `sys.modules` after `statement`."""
     names = python(f"import sys\n{statement}\nprint(*sys.modules)").split()
     return {name.partition(".")[0] for name in names}
 
 
 def import_seconds(module: str) -> float:
-    """The best of some fresh interpreters, so that a busy machine does not decide."""
+    """Return the shortest import time in several fresh interpreters, so that a busy machine does
+    not matter.
+    """
     code = (
         f"import time; begin = time.perf_counter(); import {module}; print(time.perf_counter() "
         "- begin)"
@@ -85,8 +89,8 @@ def test_a_heavy_import_would_be_seen() -> None:
     assert "pydantic" in loaded_by("import vlagents_ray, pydantic") & HEAVY
 
 
-# Imports each module by itself, in a fork of an interpreter that has what comes before most of
-# them: the package, and what a robot installs.
+# Imports each module separately, in a fork of an interpreter that has already imported the common
+# parts: the package, and the light packages of a robot.
 EACH_IN_A_FORK = """
 import os, sys, numpy, simplejpeg, vlagents_ray, websockets.sync.client
 for module in sys.argv[1:]:

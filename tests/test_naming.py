@@ -1,4 +1,4 @@
-"""Names of files and features: one for each."""
+"""Names of files and features are unique."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_no_two_names_become_the_same_in_whatever_order_they_come(names: list[st
 
 
 def test_the_second_of_a_key_is_found_among_many() -> None:
-    # In quadratic time, it would take an hour.
+    # An algorithm with quadratic time would take an hour.
     pairs = [(str(number), number) for number in range(200_000)]
     assert len(without_duplicate_keys(pairs)) == 200_000
     with pytest.raises(ValueError, match="the key '199999' occurs twice"):

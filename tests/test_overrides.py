@@ -1,4 +1,4 @@
-"""Changes of settings on a command line, and files that are found by their names."""
+"""Changes of settings on a command line, and settings files that are found by name."""
 
 from __future__ import annotations
 

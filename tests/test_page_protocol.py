@@ -1,5 +1,5 @@
-"""The servers of pages, which run without HAProxy, end silent connections, and let no address
-take all of them.
+"""The servers of pages, which run without HAProxy, end silent connections, and let no address use
+all connections.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def test_one_address_does_not_take_all_connections(page: Any) -> None:
 
 @PAGES
 def test_connections_that_are_closed_at_once_delay_no_other(page: Any) -> None:
-    """While the loop is busy, they wait in the kernel: one more is not sent a second time, after
-    one second.
+    """While the event loop is busy, connections wait in the kernel. The next SYN is not dropped, so
+    it is not sent again after one second.
     """
     with page() as port:
         for _ in range(3):

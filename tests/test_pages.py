@@ -1,8 +1,8 @@
-"""What README and the pages under docs/ show works: every Python and shell block is run as typed,
-or says why not.
+"""The code in README and in the pages under docs/ works: each Python and shell block is run as
+written, or is marked with the reason why not.
 
-Each runs in a fresh folder, in which there is what a checkout has and what earlier evaluations
-left. Those that want a served policy, and tutorials, are run by test_served_pages.py.
+Each block runs in a fresh folder with the files of a checkout and the results of earlier
+evaluations. Blocks that need a served policy, and tutorials, are run by test_served_pages.py.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from recorded_results import record, runs
 from vlagents_ray.policies.scripted import Scripted
 
 README = next(page for page in PAGES if page.name == "README.md")
-# The commands of the generated page are those of the help, see cli/test_examples.py.
+# The commands on the generated page come from the help, which cli/test_examples.py tests.
 WRITTEN = [page for page in PAGES if page.name != "cli.md"]
 BLOCKS = [(page, block) for page in PAGES for block in blocks(page.read_text())]
 RUN_HERE = [
@@ -43,8 +43,8 @@ SEEDS = {"first": 0, "a": 0, "b": 10, "machine-a": 20, "machine-b": 30} | {
     f"array/{n}": 100 * n for n in range(4)
 }
 
-# What a sentence names can mostly not be typed as it stands ("vlagents-ray serve POLICY"); of the
-# rest, these are run,
+# Most commands in sentences cannot be run as they stand ("vlagents-ray serve POLICY"). Of the
+# remaining ones, these are run,
 RUN = {"vlagents-ray policies", "vlagents-ray robot --help"}
 # and these are not.
 NOT_RUN = {
@@ -74,8 +74,8 @@ NOT_RUN = {
 
 @pytest.fixture(scope="module")
 def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folders of results by the names that pages give them: an expert's at the tabletop, and a
-    sweep of a learner's.
+    """Return folders of results by the names that pages use: an expert's results at the tabletop,
+    and a sweep of a learner.
     """
     folder = tmp_path_factory.mktemp("earlier") / "runs"
     for name, seed in SEEDS.items():
@@ -94,16 +94,14 @@ def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def reader(earlier: Path, tmp_path: Path) -> Path:
-    """A folder of a reader's."""
+    """Return the working folder of a reader."""
     checkout(tmp_path)
     shutil.copytree(earlier, tmp_path / "runs")
     return tmp_path
 
 
 def named(page: Path, block: Block) -> object:
-    """Each command of a shell block starts an interpreter; what quick tests say of them is in
-    test_docs.py.
-    """
+    """Each command of a shell block exists; test_docs.py checks its options without starting it."""
     marks = [pytest.mark.integration] * (block.ray and page != README)
     marks += [pytest.mark.server] * block.ray + [pytest.mark.slow] * (
         block.ray or block.language in SHELL
@@ -140,7 +138,7 @@ def test_the_readme_is_one_that_is_read() -> None:
 
 
 def as_it_stands(line: str) -> bool:
-    """Whether a command in a sentence can be typed, with no word of it standing for another."""
+    """Return whether a command in a sentence can be run as it stands, without placeholders."""
     try:
         read_as_typed(line, whole=True)
     except ValueError:

@@ -1,6 +1,4 @@
-"""Plug-ins: what a distribution registers, and what is said of one that is broken or not
-installed.
-"""
+"""Plug-ins: the registrations of a distribution, and the messages about broken or missing ones."""
 
 from __future__ import annotations
 
@@ -42,8 +40,8 @@ NO_ENTRY = "lab_policies.mine:Mine"
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
-    """Install a distribution whose entry points are given by group; its package is
-    `lab_policies`.
+    """Return a function that installs a distribution with the given entry points by group; its
+    package is `lab_policies`.
     """
     package = tmp_path / "lab_policies"
     package.mkdir()
@@ -62,7 +60,8 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 
     monkeypatch.syspath_prepend(tmp_path)
     for module in [name for name in sys.modules if name.partition(".")[0] == "lab_policies"]:
-        monkeypatch.delitem(sys.modules, module)  # it may come from the folder of another test
+        # the module may come from the folder of another test
+        monkeypatch.delitem(sys.modules, module)
     yield write
     registry._installed_entry_points.cache_clear()
 
@@ -358,8 +357,8 @@ def test_a_robot_a_leader_and_a_subcommand_that_are_not_installed_name_their_dis
     assert doctor.plugins().detail.endswith("; not installed: vlagents-ray-cranes")
 
 
-# Prints the exit status and the output of each command that the plug-ins of this repository have,
-# where none of them is installed.
+# Prints the exit status and the output of each command of this repository's plug-ins, with no
+# plug-in installed.
 WITHOUT_PLUGINS = """
 import contextlib, importlib.metadata, io, json
 

@@ -1,5 +1,5 @@
-"""docs/programs.md says which programs of others were run, in which versions; `tables` compares
-its text.
+"""docs/programs.md lists the tested third-party programs with their versions; `tables` compares its
+text.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Docstrings of the public names: whole sentences, and every argument by its name."""
+"""The docstrings of public names have whole sentences, and describe each argument by name."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from surface import MODULES
 
 from vlagents_ray import registry
 
-# A summary that begins with one of these is a fragment, which is understood with the name beside it
-# alone.
+# A summary that begins with one of these words is a fragment, which is clear only next to the name.
 FRAGMENTS = {
     "as",
     "how",
@@ -39,7 +38,7 @@ FRAGMENTS = {
 ROOT = Path(__file__).parents[1]
 SOURCES = ("vlagents_ray", "plugins", "examples", "benchmarks")
 INDENTED = re.compile(r"(?:^ {4}.*\n|^\n(?= {4}))+", re.MULTILINE)
-# An indented block of a docstring that begins like this is Python.
+# An indented block in a docstring that begins like this is Python.
 PYTHON = re.compile(r"(from|import|with|for) .*|\w+(\.\w+)*(, \w+)* = .*")
 
 
@@ -53,7 +52,7 @@ class Documented:
     returns: bool = False
 
     def faults(self) -> Iterator[str]:
-        """What is wrong with the docstring, in words."""
+        """Return the faults of the docstring, in words."""
         summary = " ".join(self.doc.partition("\n\n")[0].split())
         words = re.findall(r"[\w'.`]+", summary)
         if (
@@ -78,13 +77,13 @@ class Documented:
 
 
 def section(doc: str, title: str) -> str:
-    """The indented lines below `title:`; "" if there are none."""
+    """Return the indented lines below `title:`; "" if there are none."""
     found = re.search(rf"(?ms)^{title}:\n((?:    .*?(?:\n|\Z)|\n)+)", doc)
     return found[1] if found else ""
 
 
 def public_names() -> Iterator[tuple[str, Any]]:
-    """Every name that users import, with its full name."""
+    """Yield each name that users import, with its full name."""
     for module in MODULES:
         loaded = importlib.import_module(module)
         yield from ((f"{module}.{name}", getattr(loaded, name)) for name in loaded.__all__)
@@ -94,10 +93,11 @@ def public_names() -> Iterator[tuple[str, Any]]:
 
 
 def documented(name: str, value: Any) -> Iterator[Documented]:
-    """The docstrings of a public name; of a class, those of its methods and properties as well.
+    """Yield the docstring of a public name. For a class, also yield those of its methods and
+    properties.
 
-    A method that overrides another one inherits its docstring, or the description of its arguments
-    alone.
+    A method that overrides another one inherits its docstring, or only the description of its
+    arguments.
     """
     if inspect.isfunction(value):
         yield of_function(name, value)
@@ -130,10 +130,12 @@ def of_function(name: str, function: Callable[..., Any], *, method: bool = False
 
 
 def of_class(name: str, cls: type[Any]) -> Documented:
-    """Its docstring with its constructor's; a dataclass says at each field what it is."""
+    """Return a class's docstring with its constructor's. A dataclass documents its arguments at the
+    fields.
+    """
     own = vars(cls).get("__init__")
     doc = inspect.cleandoc(cls.__doc__ or "")
-    # Python itself gives a protocol a constructor, and a class that inherits from one when it is
+    # Python adds a constructor to a protocol, and to a class that inherits from one when it is
     # first called.
     inherited = not inspect.isfunction(own) or own.__module__ == "typing"
     if inherited or (dataclasses.is_dataclass(cls) and own.__doc__ is None):
@@ -181,8 +183,8 @@ def test_a_good_docstring_has_no_fault() -> None:
 
 
 def wrong_examples(source: str) -> list[str]:
-    """Return the Python examples in the docstrings of a module that are no valid Python, such as
-    those that were wrapped as prose.
+    """Return the invalid Python examples in the docstrings of a module, such as those that were
+    wrapped like prose.
     """
     wrong = []
     for node in ast.walk(ast.parse(source)):

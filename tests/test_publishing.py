@@ -1,6 +1,4 @@
-"""What the repository has beside its code for those who cite, build and publish it is accepted
-by its own tools.
-"""
+"""The files for citing, building and publishing the project are valid for their own tools."""
 
 from __future__ import annotations
 
@@ -61,7 +59,7 @@ def test_what_workflows_run_of_this_repository_exists(workflow: Path) -> None:
 
 
 def test_the_makefile_holds_ray_at_the_versions_of_a_server() -> None:
-    """Whatever is installed into `.venv` later must not replace Ray: clients share it."""
+    """Later installations into `.venv` must not replace Ray, whose version clients share."""
     recipe = re.search(r"^\t@(sed .*) pyproject.toml >>\$@$", MAKEFILE, re.MULTILINE)
     assert recipe is not None
     command = ["bash", "-c", f"{recipe[1]} pyproject.toml"]
@@ -72,7 +70,7 @@ def test_the_makefile_holds_ray_at_the_versions_of_a_server() -> None:
 
 
 def test_the_flood_table_is_played_whole_each_night() -> None:
-    """`make integrations` runs a part of its rows, for too short a time for p99."""
+    """`make integrations` runs only part of the table's rows, and too briefly for p99."""
     table = "tests/serve/test_flood.py"
     settings = set(re.findall(r"VLAGENTS_FLOOD_[A-Z]+", (ROOT / table).read_text()))
     assert settings == {"VLAGENTS_FLOOD_ALL", "VLAGENTS_FLOOD_SECONDS"}
@@ -141,7 +139,7 @@ def test_a_changed_requirement_or_torch_makes_the_table_old(
 ) -> None:
     before = resolved.digest()
     monkeypatch.setitem(resolved.EXTRAS, "check", [])
-    assert resolved.digest() == before  # what only developers install is not in it
+    assert resolved.digest() == before  # packages for developers are not part of it
     (tmp_path / "torch.txt").write_text("torch==9.0\n")
     with monkeypatch.context() as patch:
         patch.setattr(resolved, "TORCH", tmp_path / "torch.txt")
@@ -153,7 +151,7 @@ def test_a_changed_requirement_or_torch_makes_the_table_old(
 def test_the_digest_of_the_table_is_the_same_in_each_process() -> None:
     command = [sys.executable, "-c", "import resolved; print(resolved.digest())"]
     digests = set()
-    for seed in range(4):  # by which Python orders sets of texts
+    for seed in range(4):  # hash seeds, which determine the order of sets of texts
         env = {
             **os.environ,
             "PYTHONHASHSEED": str(seed),

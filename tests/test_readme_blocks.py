@@ -1,4 +1,4 @@
-"""The mechanism behind test_pages.py, on texts of its own."""
+"""The mechanism behind test_pages.py, tested with separate texts."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_only_python_and_shell_blocks_are_taken() -> None:
             None,
         ),
         ("<!-- not run: needs a robot -->\n", None, False, "needs a robot"),
-        # It does not stand straight above.
+        # The comment is not directly above the block.
         ("<!-- not run: needs a robot -->\nSome text.\n", None, False, None),
     ],
 )

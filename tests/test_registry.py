@@ -1,6 +1,4 @@
-"""Names of policies, wrappers and environments, and the cure for an optional package that is not
-installed.
-"""
+"""Names of policies, wrappers and environments, and the cure for a missing optional package."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ REQUIREMENTS = {name: registry.requirements_file(name).read_text() for name in F
 
 @pytest.fixture
 def nothing_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every optional import fail."""
+    """Let each optional import fail."""
 
     def missing(name: str) -> None:
         raise ModuleNotFoundError(f"No module named {name!r}", name=name.partition(".")[0])
@@ -44,7 +42,7 @@ def cure(module: str) -> str:
 
 
 def environments_in(text: str) -> list[str]:
-    """The names for `vlagents-ray venv create` in a cure."""
+    """Return the names for `vlagents-ray venv create` in a cure."""
     _, _, several = text.partition("; NAME is that of the policy's family: ")
     return several.split(", ") if several else re.findall(r"venv create (\w+)", text)
 
@@ -66,7 +64,7 @@ def test_a_missing_model_package_is_cured_by_its_requirements_file(
     module: str, files: list[str]
 ) -> None:
     text = cure(module)
-    assert "pip install" not in text, "an extra of this package would not bring it"
+    assert "pip install" not in text, "an extra of this package would not install it"
     assert "vlagents-ray venv create " in text
     assert environments_in(text) == files
 
@@ -84,7 +82,7 @@ def test_a_missing_simulator_or_runtime_is_cured_by_its_extra() -> None:
 
 
 class InstalledFrom:
-    """The distribution of this package, as pip has recorded its installation."""
+    """The distribution of this package, with pip's record of its installation."""
 
     def __init__(self, record: str | None) -> None:
         self._record = record
@@ -123,7 +121,7 @@ def test_what_was_installed_from_a_checkout_is_cured_by_that_checkout(
     assert shlex.split(pip_install()) == [*install, f"{checkout}"]
     assert shlex.split(pip_install("libero", "vlagents-ray-sims")) == [*install, f"{sims}[libero]"]
     assert shlex.split(pip_install(distribution="vlagents-ray-sims")) == [*install, sims]
-    assert pip_install("arm", "cranes") == "pip install 'cranes[arm]'"  # a plug-in of others
+    assert pip_install("arm", "cranes") == "pip install 'cranes[arm]'"  # a third-party plug-in
 
 
 @pytest.mark.parametrize(
@@ -144,7 +142,7 @@ def test_what_was_installed_without_a_checkout_is_cured_by_a_package_index(
 
 
 def extras_named_in_code() -> set[tuple[str, str]]:
-    """The arguments of all calls of `pip_install`: extra, distribution."""
+    """Return the arguments (extra, distribution) of all calls of `pip_install`."""
     named = set()
     for source in (*ROOT.glob("vlagents_ray/**/*.py"), *ROOT.glob("plugins/*/*/**/*.py")):
         for node in ast.walk(ast.parse(source.read_text())):
@@ -187,7 +185,7 @@ def test_a_package_that_no_requirements_file_installs_is_cured_by_pip() -> None:
 
 
 def required() -> Iterator[str]:
-    """The top-level packages that the code imports through `require`."""
+    """Return the top-level packages that the code imports through `require`."""
     packages = (ROOT / "vlagents_ray", ROOT / "plugins/vlagents_ray_models/vlagents_ray_models")
     for path in (path for package in packages for path in package.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):

@@ -1,7 +1,5 @@
-"""Which tests are imported, that CI skips none but those of missing hardware, a second try of
-those that failed, and the mutants that tests are to find.
-
-Tried on small test files.
+"""Tests of the test machinery, with small test files: which tests are imported, skips on CI, the
+second run of failed tests, and the mutants that tests must detect.
 """
 
 from __future__ import annotations
@@ -72,8 +70,8 @@ SUPPORT = Path(__file__).parent / "support"
 
 
 def outcome(folder: Path, *bodies: str, strict: bool = True) -> tuple[int, str]:
-    """Exit status and output of pytest on files that hold one of `bodies` each: test_0.py,
-    test_1.py, …
+    """Return exit status and output of pytest on files test_0.py, test_1.py, … with one of `bodies`
+    each.
     """
     for number, body in enumerate(bodies):
         (folder / f"test_{number}.py").write_text(f"import pytest\n{body}\n")
@@ -90,7 +88,7 @@ def outcome(folder: Path, *bodies: str, strict: bool = True) -> tuple[int, str]:
             "COLUMNS": "300",
             "PYTHONPATH": str(SUPPORT),
             "VLAGENTS_FAIL_ON_SKIP": str(int(strict)),
-            # Other plugins take longer to load than the test to run.
+            # Other plugins take longer to load than the test takes to run.
             "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
         },
         capture_output=True,
@@ -111,8 +109,8 @@ SKIPS = {
 
 @pytest.fixture(scope="module")
 def skipping(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """What pytest says of a file for each kind of skip, of one for a GPU, and of an expected
-    failure.
+    """Return pytest's report for a file with each kind of skip, for one that needs a GPU, and for
+    an expected failure.
     """
     gpu = "@pytest.mark.gpu\ndef test_a(): pytest.skip('no GPU')"
     expected = "@pytest.mark.xfail\ndef test_a(): assert False"
@@ -172,7 +170,7 @@ def test_right():
 
 
 def run(folder: Path, ci: str) -> tuple[int, str]:
-    """Exit status and output of the script in `folder`."""
+    """Return exit status and output of the script in `folder`."""
     (folder / "test_some.py").write_text(TESTS)
     environment = {**os.environ, "CI": ci, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     done = subprocess.run(

@@ -1,5 +1,5 @@
-"""What README and docs show of a served policy works, and each tutorial from its first block to
-its last.
+"""The code in README and docs that needs a served policy works, and each tutorial works from its
+first block to its last.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _SERVED = [
     for block in blocks(page.read_text())
     if block.server
 ]
-# Of examples/: a loop in which the guard rejects the random policy's actions, and the notebook.
+# Examples: a loop in which the guard rejects the random policy's actions, and the notebook.
 _LOOP = (
     "python examples/robot_loop.py http://gpu-box:8000 >said\ngrep 'refused, .* a step of at most "
     "max_step' said"
@@ -47,14 +47,16 @@ _SERVED += [
     (EXAMPLES / "robot_loop.py", Block("bash", 1, _LOOP, "random")),
     (EXAMPLES / "tour.ipynb", code_of(EXAMPLES / "tour.ipynb", "scripted")),
 ]
-# One server after the other, and first the one that is still there from the tutorials.
+# Sorted by server, beginning with the server that the tutorials have left running.
 SERVED = sorted(_SERVED, key=lambda one: (one[1].server != "noop", str(one[1].server)))
 OF_README = [block for page, block in SERVED if page == README]
 
 
 @pytest.fixture(scope="module")
 def host_of(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str | None], str]]:
-    """A policy's "host:port"; its server is started when first asked for. One runs at a time."""
+    """Return a function that returns a policy's "host:port" and starts its server at the first
+    call. Only one server runs at a time.
+    """
     with contextlib.ExitStack() as running:
         current: dict[str, str] = {}
 
@@ -83,7 +85,8 @@ def test_modules_of_ones_own_are_served_evaluated_and_trained_from_their_folder(
             f"vlagents-ray eval own_env:CraneEnv --policy {url} --episodes 2 --workers 0 "
             "--out runs/own"
         )
-        training = f"HOME={Path.home()} python rl_loop.py {url} >learned"  # Ray's token is there
+        # Ray's token is in this folder
+        training = f"HOME={Path.home()} python rl_loop.py {url} >learned"
         run(Block("bash", 1, f"{evaluation}\n{training}"), folder, host)
         learned = re.findall(r"^servo@\d+: (\d+)%", (folder / "learned").read_text(), re.MULTILINE)
         assert (learned[0], int(learned[-1]) > 50) == ("0", True)
@@ -119,7 +122,7 @@ def test_a_tutorial_works_from_top_to_bottom(
 def test_a_block_of_the_readme_works_with_a_server_in_this_process(
     block: Block, tmp_path: Path
 ) -> None:
-    """Below it has a server as a reader starts it, as all other blocks have."""
+    """test_pages below uses a separate server, like a reader."""
     assert block.server == "noop"
     with policy_server(Noop.from_config({})) as port:
         run(block, tmp_path, f"127.0.0.1:{port}")

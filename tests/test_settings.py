@@ -1,6 +1,4 @@
-"""Values of settings that have no model: compared with annotations and defaults where these are
-plain.
-"""
+"""Values of settings without a model are compared with plain annotations and defaults."""
 
 from __future__ import annotations
 

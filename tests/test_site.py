@@ -1,4 +1,4 @@
-"""The site that `make docs` builds, as a browser shows it from the file system."""
+"""The site that `make docs` builds, opened by a browser from the file system."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = [
 
 
 class PageLinks(HTMLParser):
-    """Where a page leads to, and the anchors in it."""
+    """The targets of a page's links, and its anchors."""
 
     def __init__(self, page: Path) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class PageLinks(HTMLParser):
 
 
 def test_every_link_within_the_site_leads_to_a_file_and_an_anchor_in_it() -> None:
-    # Of a server's root.
+    # 404.html has links relative to a server's root.
     pages = {page: PageLinks(page) for page in SITE.rglob("*.html") if page.name != "404.html"}
     broken = set()
     for links in pages.values():
@@ -76,7 +76,7 @@ def test_llms_txt_names_each_page_of_the_navigation() -> None:
     assert "- [LeRobot](policies/lerobot.html): The policy `lerobot` " in listing
 
 
-# The lines of the module's path that heads a page of the reference.
+# The number of lines of the module's path in the heading of a reference page.
 LINES_OF_A_PATH = "document.querySelector('h1 code')?.getClientRects().length"
 
 
@@ -136,5 +136,5 @@ def test_the_search_finds_pages_without_a_server(page: Page) -> None:
             )
     found = '[...document.querySelectorAll(".md-search-result__link")].map(link => link.href)'
     wanted = (SITE / "control_loop.html").as_uri()
-    # Of the whole word.
+    # A match of the whole word.
     wait_for(lambda: any(link.startswith(wanted) for link in page.value(found)))

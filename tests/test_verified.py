@@ -1,4 +1,6 @@
-"""docs/policies/verification.md says what the tests of model families verify, and no more."""
+"""docs/policies/verification.md contains exactly the properties that the tests of model families
+verify.
+"""
 
 from __future__ import annotations
 

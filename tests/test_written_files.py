@@ -1,8 +1,8 @@
-"""Files that scripts of tests/support write are up to date: tables of the pages, and
+"""The files that scripts in tests/support write are up to date: the tables in the pages, and
 tests/surface.txt.
 
-What README and docs/ say about the registered adapters follows from the registry. What users write
-down changes only where a review sees it.
+The statements in README and docs/ about registered adapters come from the registry. The public
+surface changes only with a visible diff.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def test_the_public_surface_is_the_one_that_was_reviewed() -> None:
 
 
 def test_a_change_is_seen() -> None:
-    """Of each kind: a name, a default, a path."""
+    """The comparison must detect a changed name, default and path."""
     was = surface.FILE.read_text()
     for before, after in (
         ("batch.max_size = 16", "batch.max_size = 8"),

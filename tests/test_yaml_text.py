@@ -1,4 +1,4 @@
-"""YAML: one reader for all files, in which no key is lost."""
+"""YAML: one reader for all files, which loses no key."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ READERS = {
 }
 
 
-NO_MISTAKES = {("setting", "a tab"), ("setting", "not UTF-8")}  # text on a command line
+NO_MISTAKES = {("setting", "a tab"), ("setting", "not UTF-8")}  # valid as text on a command line
 CASES = [case for case in itertools.product(READERS, WRONG) if case not in NO_MISTAKES]
 
 

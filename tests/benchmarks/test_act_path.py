@@ -1,4 +1,4 @@
-"""The files that an act enters: in a period of one process, and over several acts."""
+"""The files whose code an act runs: in a period of one process, and over several acts."""
 
 from __future__ import annotations
 

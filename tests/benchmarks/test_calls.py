@@ -1,4 +1,4 @@
-"""Counts of calls: what is counted, and what is left out as waiting."""
+"""Counts of calls: which calls are counted, and which are excluded as waiting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Some minutes of the simulated day: what its checks find, and that a seed replays."""
+"""Some minutes of the simulated day: the faults that its checks detect, and the replay of a
+seed.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +19,9 @@ def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop(
 ) -> None:
     normal = day.play_day(0, 2 * MINUTES, faults=False, relative=relative, arms=arms)
     assert normal.stops == 0
-    assert normal.moving_s > 100  # of 120
+    assert normal.moving_s > 100  # of 120 s
     assert normal.held.get("dynamics", 0) < 10, (
-        "without a fault the guard refuses hardly any of 6000 actions"
+        "without a fault the guard rejects hardly any of 6000 actions"
     )
     report = day.play_day(
         3, 10 * MINUTES, normal_step=normal.largest_step, relative=relative, arms=arms
@@ -46,7 +48,9 @@ def test_a_guard_without_limits_lets_jumps_through_which_the_day_finds(
 
 
 def test_a_restart_from_afar_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The world's own check: a watchdog that restarts by itself commands without an operator."""
+    """The simulation itself checks this: a watchdog that restarts by itself commands the robot
+    without an operator.
+    """
     monkeypatch.setattr(day.DayWatchdog, "overdue", lambda self: (self.restart() and None, None))
     report = day.play_day(3, 3 * MINUTES, normal_step=0.02)
     assert any("a command after: stop from afar" in one for one in report.violations)

@@ -1,5 +1,5 @@
-"""Whole evaluations against the peers': everybody runs the same, and whoever did not is found
-out.
+"""Whole evaluations compared with other systems: all run the same plan, and a system that did not
+is detected.
 """
 
 from __future__ import annotations
@@ -62,7 +62,9 @@ def test_an_episode_is_noted_when_it_has_ended(tmp_path: Path) -> None:
 
 
 def test_a_slow_simulator_is_cpu_time(tmp_path: Path) -> None:
-    """Not the clock's: that runs on while another process has the core."""
+    """The slow step uses CPU time, not wall time, which would pass while another process has the
+    core.
+    """
     import time
 
     with make_env(TIMED_ENV, **FEW.env(tmp_path) | {"step_ms": 20.0}) as env:

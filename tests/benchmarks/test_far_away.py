@@ -1,4 +1,4 @@
-"""A robot whose policy is far away, over a link that delays, loses and is cut, and through a
+"""A robot whose policy is far away, over a link with delay, loss and interruptions, and through a
 tunnel.
 """
 
@@ -55,7 +55,8 @@ PidFile none
 StrictModes no
 UsePAM no
 """
-USER = "www-data"  # Debian and Ubuntu have it; `sshd` runs as this user, and lets only this one in
+# a user of Debian and Ubuntu; `sshd` runs as this user, and accepts only this one
+USER = "www-data"
 DRIVE = """
 import json, sys
 from benchmarks.far_robot import FarRobot
@@ -69,7 +70,7 @@ for url in sys.argv[1:]:
 
 
 class Far(NamedTuple):
-    """Two hosts far from each other, and the policy's server on one of them."""
+    """Two hosts far from each other, with the policy's server on one of them."""
 
     cloud: Host
     home: Host
@@ -102,7 +103,8 @@ def test_the_link_delays_loses_and_cuts_packets_and_heals(far: Far) -> None:
         delayed = round_trips_s(50)
         assert len(delayed) == 50
         assert delayed[0] >= 0.08
-        far.link.set(Conditions(loss=0.3))  # each way: about half comes back
+        # in each direction, so about half of the round trips succeed
+        far.link.set(Conditions(loss=0.3))
         assert 5 < len(round_trips_s(50)) < 45
         far.link.set(Conditions(cut=True))
         assert round_trips_s(5) == []
@@ -119,7 +121,7 @@ def test_a_robot_stands_while_the_link_is_cut_and_then_goes_on_by_itself_with_wh
         found, healed = run(
             arm, far.link, conditions, 3.5, 1.0, seconds=90, mode="async", recovers=True
         )
-    wait_for(lambda: far.server.request("sessions", 30)[0] == 0)  # none stays behind
+    wait_for(lambda: far.server.request("sessions", 30)[0] == 0)  # no session is left
     _, opened = far.server.request("sessions", 30)
     assert healed is not None
     ticks = found["ticks"]
@@ -129,12 +131,12 @@ def test_a_robot_stands_while_the_link_is_cut_and_then_goes_on_by_itself_with_wh
     assert found["safe"]
     assert acted[-round(HZ) :].all()
     drove = np.flatnonzero(acted)
-    # The tick of the observation behind each executed action.
+    # The tick of the observation from which each executed action was computed.
     seen = drove - np.array(ticks["age_ticks"])
     assert max(ticks["age_ticks"]) <= MAX_AGE_S * HZ + 1
-    # It stood at the end of the cut.
+    # The robot stood still at the end of the interruption.
     assert not ((at[drove] > healed - 1.0) & (at[drove] < healed)).any()
-    # Nothing that was planned before is executed after it.
+    # No action that was planned before the end is executed after it.
     assert (at[seen[at[drove] > healed]] > healed).all()
     assert ticks["twice"] == 0
     assert opened - before == 1 + found["resumed"]
@@ -142,7 +144,7 @@ def test_a_robot_stands_while_the_link_is_cut_and_then_goes_on_by_itself_with_wh
 
 @contextmanager
 def tunnel(near: Host, far: Host, address: str, *forwarded: str) -> Iterator[None]:
-    """`ssh` at `near` to the `sshd` of a user at `far`, with what is forwarded: -L or -R and its
+    """Run `ssh` at `near` to the `sshd` of a user at `far`. The arguments are -L or -R with its
     ports.
     """
     with tempfile.TemporaryDirectory() as name:
@@ -181,7 +183,7 @@ def tunnel(near: Host, far: Host, address: str, *forwarded: str) -> Iterator[Non
                 with near.start(
                     ["ssh", *options, "-i", str(folder / "user"), "-p", "2222", f"{USER}@{address}"]
                 ) as ssh:
-                    assert ssh.wait(60) == 0  # it continues behind
+                    assert ssh.wait(60) == 0  # it continues in the background
                 yield
             finally:
                 sshd.terminate()

@@ -1,4 +1,6 @@
-"""The settings of the fleet benchmark, and a small fleet at a server, also over an emulated link."""
+"""The settings of the fleet benchmark, and a small fleet with a server, also over an
+emulated link.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,7 @@ def test_a_plan_crosses_a_process_as_json() -> None:
 
 
 class Late(Agent):
-    """A policy whose answers come after the end of a measurement."""
+    """A policy whose answers arrive after the end of a measurement."""
 
     contract = Contract(action=ActionSpec(dim=7, delta=True), chunk=8)
 

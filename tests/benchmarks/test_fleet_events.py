@@ -9,13 +9,13 @@ from benchmarks.fleet_events import Event, summary
 
 def test_an_event_counts_the_ticks_until_the_next_one() -> None:
     killed = Event("a replica killed", 10.0, 20)
-    # Before it, in its first and its third second, and after the next event.
+    # Before the event, in its first and its third second, and after the next event.
     late = [9.9, *([10.2] * 50), *([12.5] * 5), 40.0]
     figures = summary(killed, 40.0, late, hz=10.0)
     assert figures["starved"] == 55
     assert figures["share"] == pytest.approx(1 - 55 / 6000)
     assert figures["worst_second"] == pytest.approx(1 - 50 / 200)
-    assert figures["in_time_again_s"] == 3, "2.5 % of the third second's ticks are missed"
+    assert figures["in_time_again_s"] == 3, "2.5 % of the third second's ticks were missed"
 
 
 def test_an_event_without_a_late_tick_was_in_time_at_once() -> None:

@@ -1,4 +1,4 @@
-"""The table and the picture of several measurements of fleets."""
+"""The table and the picture of several fleet measurements."""
 
 from __future__ import annotations
 

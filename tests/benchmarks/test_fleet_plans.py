@@ -1,4 +1,4 @@
-"""Plans of fleets against what their robots get, on small fleets."""
+"""Plans of fleets compared with the results of their robots, with small fleets."""
 
 from __future__ import annotations
 

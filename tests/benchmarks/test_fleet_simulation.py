@@ -1,4 +1,4 @@
-"""The simulation of a large fleet, on a small one."""
+"""The simulation of a large fleet, tested with a small one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMALL = Shape(robots=100, replicas=10, nodes=5)
 
 
 def result_of(name: str, shape: Shape = SMALL) -> Outcome:
-    """The outcome of a scenario for a small fleet."""
+    """Return the outcome of a scenario for a small fleet."""
     scenario = SCENARIOS[name]
     tally, world = run(scenario, shape, seed=1)
     assert sum(replica.sessions for replica in world.replicas["pi0"]) == shape.robots
@@ -35,7 +35,7 @@ def test_all_robots_that_start_at_once_are_in_time() -> None:
         result = result_of(name)
         assert result.worst_share >= IN_TIME
         assert result.late_robots == 0
-        assert result.most_sessions <= 13, "a quarter more than the mean is tolerated"
+        assert result.most_sessions <= 13, "a quarter more than the mean must be tolerated"
 
 
 def test_a_hash_places_sessions_less_evenly() -> None:

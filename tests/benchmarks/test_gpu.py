@@ -1,5 +1,5 @@
-"""The steps of `make gpu` run in separate processes, and the report says what each found, or
-why it ended.
+"""The steps of `make gpu` run in separate processes, and the report contains the result of each, or
+the reason of its end.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def hangs(lab: Lab) -> None:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The report of steps of all kinds."""
+    """Return the report of steps of all kinds."""
     plan = Plan(tmp_path_factory.mktemp("out"), tmp_path_factory.mktemp("scratch"), dry=True)
     steps = {"finds": finds, "misses": misses, "fails": fails, "dies": dies, "hangs": hangs}
     runner = Runner(
@@ -68,7 +68,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     assert (plan.out / "gpu.md").read_text().count("**no**") == 4
     log = (plan.out / "gpu.log").read_text()
     assert "illegal memory access" in log
-    assert "Timeout (" in log  # where the step that hangs was
+    assert "Timeout (" in log  # the place at which the step hung
     assert "in hangs" in log
     document: dict[str, Any] = json.loads((plan.out / "gpu.json").read_text())
     return document
@@ -260,7 +260,7 @@ def test_the_commit_says_whether_files_have_changed_since(
 
 
 def report_of(date: str, commit: str, **figures: Any) -> dict[str, Any]:
-    """A report of the step "graphs"."""
+    """Return a report of the step "graphs"."""
     return {
         "date": date,
         "commit": commit,
@@ -287,7 +287,7 @@ def test_the_tables_of_the_page_have_card_date_and_commit_and_say_what_is_older(
     ]
     page, latest = tmp_path / "page.md", tmp_path / "latest.json"
     page.write_text(f"before {tables.BEGIN} old {tables.END} after")
-    for report in (second, first):  # the order does not matter
+    for report in (second, first):  # the order of the reports does not matter
         file = tmp_path / f"{report['commit']}.json"
         file.write_text(json.dumps(report))
         tables.main([file], latest, page)
@@ -326,7 +326,7 @@ def test_replays_beside_captures_report_which_of_them_failed(
     monkeypatch: pytest.MonkeyPatch, disturbs: bool
 ) -> None:
     torch = pytest.importorskip("torch")
-    from fake_cuda import FakeCuda  # it needs torch
+    from fake_cuda import FakeCuda  # this module needs torch
 
     cuda = FakeCuda()
     cuda.install(monkeypatch)
@@ -373,7 +373,7 @@ def test_the_network_is_timed_alone_and_once(monkeypatch: pytest.MonkeyPatch) ->
         outer = Compilation(False).core("outer", inner)
     assert timer.measure(lambda: (next(clock), outer(rows[0]), next(clock), inner(rows[0]))) == 2000
     assert timer.measure(lambda: None) is None
-    inner(rows[0])  # not measured: takes no time from the clock
+    inner(rows[0])  # an unmeasured call, which takes no time on the simulated clock
     assert Compilation(False).core("plain", inner) is inner
 
 

@@ -1,4 +1,4 @@
-"""The fleet of robots and the curves by sessions and replicas."""
+"""The fleet of robots, and the curves by number of sessions and replicas."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_an_act_is_on_time_if_it_ends_within_its_period() -> None:
 
 
 class SlowAgent:
-    """Takes 0.15 s for an act."""
+    """A policy whose acts take 0.15 s."""
 
     def reset(self, *_: object) -> dict[str, int]:
         return {"pid": 7}
@@ -52,7 +52,8 @@ def test_a_robot_skips_the_ticks_that_pass_during_an_act(monkeypatch: pytest.Mon
 def test_the_fleet_and_both_curves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plan = GrowthPlan(robots=10, hz=10, sessions=[1, 6], replicas=[1, 2], acts_per_s=100, seconds=1)
     found = json.loads(json.dumps(measure_growth(plan)))
-    assert 0 < found["fleet"]["acts"] <= 100  # 100 ticks, some of which pass if the machine is busy
+    # 100 ticks, some of which are missed if the machine is busy
+    assert 0 < found["fleet"]["acts"] <= 100
     assert [one["sessions"] for one in found["sessions"]] == [1, 6]
     assert [one["replicas"] for one in found["replicas"]] == [1, 2]
     assert [sum(one["sessions_by_replica"]) for one in found["replicas"]] == [10, 10]

@@ -1,4 +1,4 @@
-"""The comparison of learners at a small size, its table and its picture."""
+"""The comparison of learners at a small size, with its table and its picture."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_a_series_that_was_interrupted_continues(
     figures = train(tmp_path, "cloning")
     assert executed == ["record", "train", "train"]
     assert train(tmp_path, "cloning") == figures
-    assert executed == ["record", "train", "train"], "nothing is repeated"
+    assert executed == ["record", "train", "train"], "finished learners must not be trained again"
 
 
 @pytest.mark.parametrize("text", ["", "one", "-1", ",".join(map(str, range(11)))])

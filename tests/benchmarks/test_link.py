@@ -1,4 +1,4 @@
-"""What the link is made of, and what a user without the right to make it is told."""
+"""The parts of the emulated link, and the message for a user without the right to create it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_missing_tools_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 
 
 def test_both_namespaces_end_with_a_bench_that_was_killed() -> None:
-    """The client's is held by a process, the server's by the bench itself."""
+    """A process keeps the client's namespace alive, and the bench itself the server's."""
     try:
         command = enter()
     except ConfigError as error:
@@ -65,7 +65,9 @@ def test_both_namespaces_end_with_a_bench_that_was_killed() -> None:
 @pytest.mark.server
 @pytest.mark.alone
 def test_round_trips_over_a_link_or_the_reason_why_not(tmp_path: Path) -> None:
-    """A slow link, so that the pixels of a call (300 kB) visibly take longer than their JPEG."""
+    """The link is so slow that the pixels of a call (300 kB) take visibly longer than their
+    JPEG.
+    """
     try:
         enter()
     except ConfigError as error:

@@ -1,5 +1,5 @@
-"""The benchmark of an evaluation's overhead, and CPU time of other processes, count what they
-say.
+"""The figures of the benchmark of an evaluation's overhead, and of the CPU time of other
+processes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def test_workers_that_never_play_together_are_an_error() -> None:
 @pytest.mark.ray
 @pytest.mark.alone
 def test_it_measures_the_tabletop() -> None:
-    for _ in range(5):  # what else the machine does during the bare episodes may mislead
+    for _ in range(5):  # other work of the machine during the bare episodes may distort the result
         found = measure_overhead("tabletop", workers=2, episodes=10, rounds=1)
         if found.ratio < 1 and found.to_json()["median_added_cpu_ms_per_step"] > 0:
             break
@@ -66,7 +66,7 @@ def test_what_a_process_used_is_counted_and_stays_counted_when_it_has_ended() ->
         with CpuSampler(lambda: [burning.pid]) as cpu:
             burning.stdout.readline()
             assert cpu_seconds(burning.pid) >= 0.4
-            time.sleep(0.5)  # a sample or two
+            time.sleep(0.5)  # one or two samples
             burning.stdin.close()
             burning.wait()
             time.sleep(0.5)

@@ -1,5 +1,5 @@
-"""Clients in other languages and other policy servers: which are measured, and a script that
-stands for one.
+"""Clients in other languages and other policy servers: the list of measured ones, and a script that
+stands in for one.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def test_a_server_that_ends_is_named_before_its_clients_have_waited_for_it(
 def test_a_killed_bench_takes_its_processes_along(
     fake: PeerClient, obs: Path, command: str
 ) -> None:
-    """A driver waits on its input, a server serves; neither is told that the bench has died."""
+    """A driver waits for input and a server serves; neither is notified when the bench dies."""
     port = free_port()
     words = [str(PYTHON), fake.script, command, "127.0.0.1", str(port)]
     words += ["{}"] if command == "serve" else [str(obs), "raw", "{}"]
@@ -199,8 +199,8 @@ def test_a_killed_bench_takes_the_processes_of_a_server_along_that_it_has_stoppe
         pids = descendants(bench.pid)
         stopped = [pid for pid in pids if state(pid) == "T"]
         bench.send_signal(signal.SIGKILL)
-    assert len(stopped) == 2  # the server, and the process that it has spawned
-    assert len(pids) == 4  # also the client, and the helper of multiprocessing
+    assert len(stopped) == 2  # the server, and its child process
+    assert len(pids) == 4  # also the client, and the helper process of multiprocessing
     wait_for(lambda: all(gone(pid) for pid in pids), 10.0)
 
 
@@ -244,7 +244,7 @@ def test_a_fleet_makes_load_with_the_policy_of_the_plan(fake: PeerClient, obs: P
             robot, simulation = fleet.run(1, 1, 0.3)
         assert len(both) == 2
         for calls in (*both, simulation, robot):
-            # 2 ms and 1 ms a row, of which the fake says three.
+            # 2 ms and 1 ms per row for three rows, as the stand-in reports.
             assert all(rest == [5.0, 3] for _, _, *rest in calls)
         assert 0 < len(robot) < len(simulation)
 
@@ -294,7 +294,7 @@ def test_a_peer_that_is_not_installed_is_skipped_by_name_with_the_cure(tmp_path:
     found, skipped, _ = peer_clients(["openpi"], tmp_path / "python")
     assert found == []
     assert "benchmarks.peers" in skipped["openpi"]
-    # Rpyc conflicts with nothing, but is not here.
+    # rpyc conflicts with nothing, but is not installed here.
     found, skipped, _ = peer_clients(["vlagents"], Path(sys.executable))
     assert found == []
     assert set(skipped) == {"vlagents"}

@@ -1,4 +1,4 @@
-"""Replicas for robots that need much and little, in virtual time."""
+"""Placement of replicas for robots with large and small needs, in virtual time."""
 
 from __future__ import annotations
 

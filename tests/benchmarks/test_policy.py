@@ -21,9 +21,11 @@ from vlagents_ray.serve.launch.deployment_file import policy_application
 
 
 class Picky(Noop):
-    """Looks at what it is shown; how long a part of the state is, its contract leaves open."""
+    """A policy that checks its observations. Its contract leaves the length of a part of the state
+    open.
+    """
 
-    seen: list[int] = []  # noqa: RUF012 - of the class, so that tests see it
+    seen: list[int] = []  # noqa: RUF012 - a class attribute, which tests read
 
     @property
     def contract(self) -> Contract:
@@ -59,7 +61,7 @@ def test_larger_batches_give_more_actions_bare_and_behind_the_queue() -> None:
         best_of_one, best_of_four = (
             max(r["actions_per_s"] for r in size["rounds"][way]) for size in (one, four)
         )
-        # The best, as a busy machine slows down some rounds.
+        # The best round counts, since a busy machine slows down some rounds.
         assert best_of_four > 1.5 * best_of_one
         assert len(one["rounds"][way]) == 5
     # A sleep is never shorter than its argument.

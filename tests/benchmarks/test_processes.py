@@ -1,4 +1,4 @@
-"""CPU time, context switches and names of processes, and which of them belong to a server."""
+"""CPU time, context switches and names of processes, and the processes that belong to a server."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from eval_fakes import wait_for
 from benchmarks import processes
 from benchmarks.processes import UsageMeter, descendants, program, server_processes
 
-# A process that starts another one for each of its arguments, names it so, and ends with its input.
+# A process that starts a child process for each of its arguments, with this name, and ends when its
+# input ends.
 PARENT = """
 import subprocess, sys
 children = [
@@ -30,9 +31,7 @@ for child in children:
 
 @pytest.fixture(name="family")
 def running_family() -> Iterator[tuple[int, list[int]]]:
-    """Yield a process, and those that it has started: a replica, Ray's idle worker, and another
-    program.
-    """
+    """Yield a process and its children: a replica, Ray's idle worker, and another program."""
     names = ["ray::ServeReplica:noop:policy.act", "ray::IDLE", "openpi_peer.py"]
     with ExitStack() as stack:
         parent = stack.enter_context(
@@ -75,7 +74,7 @@ def test_a_thread_waits_once_each_time_that_it_sleeps() -> None:
     ) as sleeping:
         assert sleeping.stdin is not None
         assert sleeping.stdout is not None
-        # The first counts the process's start.
+        # The first meter includes the process's start.
         for meter in (UsageMeter([sleeping.pid]), UsageMeter([sleeping.pid])):
             with meter.counting():
                 sleeping.stdin.write(b"\n")
@@ -84,22 +83,22 @@ def test_a_thread_waits_once_each_time_that_it_sleeps() -> None:
         sleeping.stdin.close()
     found = meter.per_act(200)
     assert found["voluntary_switches"] == pytest.approx(1, abs=0.1)
-    assert 0 < found["cpu_ms"] < 1  # not the time that it slept
+    assert 0 < found["cpu_ms"] < 1  # without the time that it slept
 
 
 def test_the_use_while_idle_is_not_that_of_an_act(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two processes, read before and after each span: one is idle at 0.1 CPU s and 10 waits a
-    second.
+    """Two processes are read before and after each interval. The first uses 0.1 CPU s and waits 10
+    times per second while it is idle.
     """
     moments = iter([0.0, 2.0, 5.0, 6.0])
     monkeypatch.setattr(processes, "time", SimpleNamespace(monotonic=lambda: next(moments)))
     monkeypatch.setattr(processes, "program", {1: "replica", 2: "haproxy"}.__getitem__)
     counters = iter(
         [
-            (1.0, {"7": (100, 5)}), (8.0, {"8": (3, 3)}),  # the idle span of 2 s
+            (1.0, {"7": (100, 5)}), (8.0, {"8": (3, 3)}),  # the idle interval of 2 s
             (1.2, {"7": (120, 5)}), (8.0, {"8": (3, 3)}),
-            (2.0, {"7": (200, 5)}), (8.0, {"8": (3, 3)}),  # a span of 1 s with ten acts
-            # A thread began; the other process has ended.
+            (2.0, {"7": (200, 5)}), (8.0, {"8": (3, 3)}),  # an interval of 1 s with ten acts
+            # A thread has begun, and the other process has ended.
             (2.3, {"7": (230, 6), "9": (10, 0)}), None,
         ]
     )  # fmt: skip
@@ -120,7 +119,7 @@ def test_the_use_while_idle_is_not_that_of_an_act(monkeypatch: pytest.MonkeyPatc
 def test_all_is_counted_of_a_process_that_polls(monkeypatch: pytest.MonkeyPatch) -> None:
     moments = iter([0.0, 1.0, 1.0, 2.0])
     monkeypatch.setattr(processes, "time", SimpleNamespace(monotonic=lambda: next(moments)))
-    # Its client holds half of its core in the turn.
+    # The client occupies half of its core during the measurement.
     counters = iter([(0.0, {}), (1.0, {}), (1.0, {}), (1.5, {})])
     monkeypatch.setattr(processes, "_counters", lambda _: next(counters))
     meter = UsageMeter([1])

@@ -1,4 +1,4 @@
-"""docs/measured_tables.md follows from the figures alone."""
+"""docs/measured_tables.md is generated from the figures alone."""
 
 from __future__ import annotations
 
@@ -225,8 +225,8 @@ def test_a_new_measurement_replaces_the_table_of_its_title(tmp_path: Path) -> No
 
 
 def test_a_system_is_listed_once_for_each_measurement_that_lacks_it() -> None:
-    """Two parts named it differently, so that the list had it twice without a difference to see;
-    and the reason of one part replaced the reason of another.
+    """Two parts of the benchmark used different names for a system, which was therefore listed
+    twice, and one part's reason replaced the other's.
     """
     one_client = {"skipped": {"LeRobot": "its server has one client"}}
     results = {

@@ -1,4 +1,4 @@
-"""Round trips: which ways are measured in turns, and what medians, intervals and ratios say of
+"""Round trips: which transports are measured in turn, and the medians, intervals and ratios of
 known data.
 """
 
@@ -30,7 +30,7 @@ from vlagents_ray.images.jpeg_png import encode_jpeg
 
 
 class Turns:
-    """Notes whose turn it is."""
+    """A transport that records the order of its measurements."""
 
     def __init__(self, name: str, log: list[str]) -> None:
         self.name, self.log = name, log
@@ -128,11 +128,12 @@ def test_the_interval_covers_the_truth_about_as_often_as_it_says() -> None:
     for seed in range(40):
         found = median_ratio(trips("a", 1.0, seed=2 * seed), trips("b", 2.0, seed=2 * seed + 1))
         hits += found.low <= 0.5 <= found.high
-    assert hits >= 33  # 95 % of 40 is 38; 33 or fewer has a chance under 1 %
+    assert hits >= 33  # 95 % of 40 is 38; 33 or fewer has a probability under 1 %
 
 
 def test_what_slows_both_down_does_not_widen_the_ratio() -> None:
-    load = np.linspace(1, 3, 20)[:, None]  # the machine becomes three times as slow, for both alike
+    # the machine becomes three times slower, in the same way for both
+    load = np.linspace(1, 3, 20)[:, None]
     a, b = trips("a", 1.0), trips("b", 2.0, seed=1)
     found = median_ratio(RoundTrips("a", a.rounds * load), RoundTrips("b", b.rounds * load))
     assert found.low < 0.5 < found.high

@@ -1,5 +1,5 @@
-"""Scaling and endurance, on made-up numbers and in small: what is linear, what a driver costs,
-what is lost.
+"""Scaling and endurance, with constructed numbers and at a small size: linearity, the driver's
+cost, and losses.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PLAN = ScalingPlan(workers=(1, 4), rounds=3)
 
 
 def played(rate: float, **changes: object) -> PlayedEpisodes:
-    """A round in which nothing but its rate matters."""
+    """Return a round in which only the rate matters."""
     usual = PlayedEpisodes(
         rate, 30.0, ["shm"], 0, 100, 20.0, 20.0, 0.4, dict.fromkeys(DAEMONS, 0.2)
     )
@@ -59,7 +59,7 @@ def test_bytes_between_hosts_are_those_of_an_act() -> None:
 
 
 def test_the_ideal_is_what_sleeping_alone_allows() -> None:
-    """50 steps of 20 ms, and 50 acts of 50 ms, or 7 of chunks of 8 rows."""
+    """50 steps of 20 ms, and 50 acts of 50 ms, or 7 acts with chunks of 8 rows."""
     assert PLAN.ideal(4, OWN) == PLAN.ideal(4, SHARED) == pytest.approx(4 * 60 / 3.5)
     assert PLAN.ideal(4, CHUNKS) == pytest.approx(4 * 60 / 1.35)
     assert row(PLAN, CHUNKS, 4, [played(PLAN.ideal(4, CHUNKS) / 2)], [1.0])[
@@ -127,10 +127,11 @@ def test_the_part_with_the_least_room_saturates_first() -> None:
     rows = parts(SCALING, load)
     found = {row["name"]: row["saturates"] for row in rows}
     assert next(iter(found)) == "learner's link"
-    # 250 of the workers are queried each second: 10 + 250 ms; an episode takes 3 ms every 30 s.
+    # 250 of the workers are queried each second, which takes 10 + 250 ms; an episode takes 3 ms
+    # every 30 s.
     assert found["driver"] == pytest.approx(740 / 0.1)
     assert found["database"] == pytest.approx(200 * 30)
-    assert found["replicas"] == pytest.approx(20 / 0.06 * 3)  # of an act every 3 s
+    assert found["replicas"] == pytest.approx(20 / 0.06 * 3)  # one act every 3 s
     assert found["gcs_server"] == pytest.approx(1 + 0.98 / 0.001)
     assert found["ServeController"] is None or found["ServeController"] > 1e9
     assert found["head's link"] == pytest.approx(100e6 / 8 / 1000 * 3)
@@ -216,7 +217,7 @@ def test_the_verdict_names_what_is_missed(changes: dict[str, object], missed: li
 @pytest.mark.integration
 @pytest.mark.ray
 def test_killed_workers_lose_no_episode_and_repeat_none() -> None:
-    # On a busy machine one worker may play all of them while the other one starts.
+    # On a busy machine one worker may run all episodes while the other one starts.
     for _ in range(4):
         found = measure_soak(SoakPlan(episodes=300, kill_every_s=0.1, max_steps=40))
         assert found["keys_once"]

@@ -1,4 +1,4 @@
-"""The figures of a trace of autoscaling; tests/integration/test_load.py runs one."""
+"""The figures of an autoscaling trace; tests/integration/test_load.py records one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ def test_a_trace_has_the_time_of_the_replicas_and_that_of_the_last_late_tick() -
         ScaleSample(35.0, 1, 1, 1),
     ]
     plan = TracePlan(robots=3, burst_s=30.0)
-    # A second without the robot's own process is not the server's, nor is a tick of long after.
+    # Neither a second in which the robot's own process paused counts for the server, nor a tick
+    # long after the burst.
     burst = [figures([0.5, 3.0, 7.5, 25.0], missed=10), figures([1.0], resumed=1)]
     traced = report(plan, samples, [figures([-4.0])], burst)
     assert (traced["requested_s"], traced["running_s"], traced["in_time_s"]) == (4.0, 8.0, 7.5)

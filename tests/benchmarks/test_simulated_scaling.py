@@ -1,4 +1,4 @@
-"""The number of replicas that follows what robots need, in virtual time."""
+"""The number of replicas follows the needs of robots, in virtual time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FLEET = SimulatedFleet()
 def test_a_burst_gets_all_its_replicas_at_once_and_is_in_time_after_one_start() -> None:
     trace = simulate(burst, 600, FLEET)
     assert changes(trace) == [1, 3]
-    # A second of delay, to the next step of the simulation, and the start of the replicas.
+    # One second of delay, one until the next step of the simulation, and the start of the replicas.
     start_s = 2.0 + FLEET.start_s + FLEET.move_s
     assert seconds_late(trace) <= start_s
     assert all(step.missed == 0 for step in trace if step.at >= 60 + start_s)
@@ -53,7 +53,7 @@ def test_any_steady_number_of_robots_has_a_steady_number_of_replicas(robots: int
 
 
 def test_late_robots_get_one_more_replica_which_stays() -> None:
-    """Robots that need more than they state, such as those of a policy that has become slower."""
+    """Robots may need more than they declare, for example when a policy has become slower."""
     fleet = replace(
         FLEET,
         autoscaling=AutoscalingArgs(downscale_delay_s=30.0, max_replicas=16),
@@ -65,13 +65,15 @@ def test_late_robots_get_one_more_replica_which_stays() -> None:
     trace = simulate(lambda now: 0 if 600 <= now < 1200 else 6, 1800, fleet)
     assert changes(trace) == [1, 2, 1, 2]
     again = next(step.at for step in trace if step.at >= 1200 and step.requested == 2)
-    assert again <= 1205, "that they need two is remembered while they are away"
+    assert again <= 1205, "the need for two replicas must be remembered while the robots are away"
 
 
 def test_robots_that_more_replicas_do_not_help_get_one_more_at_most() -> None:
     late_always = replace(FLEET, hidden_late=lambda _, robots: robots)
     assert changes(simulate(lambda _: 6, 3000, late_always)) == [1, 2]
-    assert changes(simulate(lambda _: 1, 3000, late_always)) == [1], "a robot uses one replica"
+    assert changes(simulate(lambda _: 1, 3000, late_always)) == [1], (
+        "a robot needs only one replica"
+    )
 
 
 def test_the_load_of_robots_does_not_depend_on_where_they_are() -> None:

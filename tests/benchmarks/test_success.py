@@ -1,4 +1,6 @@
-"""The benchmark of success runs every kind of way, and finds what must be equal to be equal."""
+"""The benchmark of success runs each kind of transport and setting, and confirms that equal results
+are equal.
+"""
 
 from __future__ import annotations
 

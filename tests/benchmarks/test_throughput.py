@@ -1,4 +1,6 @@
-"""Throughput, autoscaling, pushes and rollouts: their arithmetic, and that they run."""
+"""The benchmarks of throughput, autoscaling, pushes and rollouts: their arithmetic, and
+small runs.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,7 @@ def test_a_policy_of_unknown_speed_is_measured_bare() -> None:
 
 @pytest.mark.parametrize("cut", [0.0, 0.001, 0.02, 0.0359])
 def test_the_rate_of_batches_does_not_depend_on_where_the_time_begins(cut: float) -> None:
-    """Batches of 16, a millisecond wide, every 36 ms: 444.4 a second."""
+    """Batches of 16, a millisecond wide, every 36 ms: 444.4 rows per second."""
     batches = [cut + 0.036 * batch + 0.001 * i / 16 for batch in range(56) for i in range(16)]
     calls = [(end, 72.0, 36.0, 16) for end in batches if 0.02 <= end < 2.0]
     assert rate_of([calls[::2], calls[1::2]]) == pytest.approx(16 / 0.036, rel=0.005)
@@ -79,7 +81,7 @@ def test_the_interval_of_a_mean_is_students() -> None:
 
 def test_a_bare_policy_is_run_in_full_batches() -> None:
     bare = BarePolicy("noop", {"base_ms": 10}, batch=8)
-    # Eight for each sleep of at least 10 ms; one at a time would be 100.
+    # Eight rows for each sleep of at least 10 ms; one at a time would give 100.
     rates = [bare.rate(0.1) for _ in range(5)]
     assert 100 < max(rates) <= 800
 

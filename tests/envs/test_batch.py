@@ -1,4 +1,4 @@
-"""Environments that step together, each as if it were alone."""
+"""Environments that step together behave as if each were alone."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_cameras_images_are_rows_of_one_array(batch: BatchEnv) -> None:
     assert len(arrays) == 1
     assert seen[0].cameras["front"].base.shape == (3, 32, 40, 3)
     later, *_ = batch.step([act[0] for act in (actions(0), actions(1), actions(2))])
-    # What was given stays as it was.
+    # Earlier observations stay unchanged.
     assert later[0].cameras["front"].base is not seen[0].cameras["front"].base
 
 

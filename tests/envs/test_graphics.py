@@ -1,5 +1,5 @@
-"""On which device a worker draws: with fakes of other machines' devices, and for real on this
-one's.
+"""The device on which a worker renders: with simulated devices of other machines, and with the real
+ones of this machine.
 """
 
 from __future__ import annotations

@@ -27,9 +27,11 @@ PUSHT = "gymnasium/gym_pusht/PushT-v0"
 
 
 class Arm(gymnasium.Env[dict[str, Any], np.ndarray]):
-    """A nested observation, a gripper in metres, and success after three steps."""
+    """An environment with a nested observation, a gripper in metres, and success after
+    three steps.
+    """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium declares it
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium declares it so
 
     def __init__(self, render_mode: str | None = None, broken: bool = False) -> None:
         self.render_mode = render_mode
@@ -68,7 +70,7 @@ class Arm(gymnasium.Env[dict[str, Any], np.ndarray]):
         )
 
     def observation(self) -> dict[str, Any]:
-        self.image[:] = self.count  # one buffer for all observations, as some simulators have
+        self.image[:] = self.count  # one buffer for all observations, like in some simulators
         return {"images": {"top": self.image}, "robot": {"qpos": self.qpos}}
 
     def render(self) -> Any:
@@ -76,7 +78,7 @@ class Arm(gymnasium.Env[dict[str, Any], np.ndarray]):
 
 
 class Switch(Arm):
-    """Discrete actions."""
+    """An environment with discrete actions."""
 
     def __init__(self, render_mode: str | None = None) -> None:
         super().__init__(render_mode)
@@ -128,7 +130,7 @@ def test_images_and_vectors_of_the_observation_are_found() -> None:
         assert list(env.contract.cameras or {}) == ["images/top"]
         assert list(env.contract.state or {}) == ["robot/qpos"]
         assert (env.contract.action.low, env.contract.action.high) == (None, None), (
-            "they differ by component"
+            "the limits differ by component"
         )
 
 

@@ -1,4 +1,4 @@
-"""ManiSkill as it really runs: every test here renders."""
+"""The real ManiSkill; each test here renders."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ OPEN, CLOSED = 1.0, -1.0
 
 
 def command(**parts: float) -> Act:
-    """An action of `pd_ee_delta_pose`: zeros but for the named parts."""
+    """Return an action of `pd_ee_delta_pose`, with zeros except for the given parts."""
     names = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
     return Act(np.array([parts.get(name, 0.0) for name in names], dtype=np.float32))
 
 
 def play(env: ManiSkill, seed: int, actions: list[np.ndarray]) -> list[Obs]:
-    """The first observation of the episode and those after the actions."""
+    """Return the first observation of the episode and those after the actions."""
     seen = [env.reset(seed=seed)[0]]
     seen += [env.step(Act(action))[0] for action in actions]
     return seen
@@ -65,7 +65,7 @@ def test_each_task_gives_what_its_contract_states(task: str) -> None:
         cameras = {"base_camera"} | ({"hand_camera"} if task in TWO_CAMERAS else set())
         assert set(obs.cameras) == set(contract.cameras or {}) == cameras
         assert (env.max_steps, env.instruction) == (STEP_LIMITS.get(task, 50), INSTRUCTIONS[task])
-        has_gripper = task != "PushT-v1"  # its robot holds a stick
+        has_gripper = task != "PushT-v1"  # its robot has a stick instead
         assert (contract.control_hz, contract.action.space, contract.gripper) == (
             20.0,
             "ee_pose",
@@ -88,8 +88,8 @@ def test_it_keeps_the_promises_of_an_env() -> None:
 
 @pytest.mark.parametrize("task", ["PegInsertionSide-v1", "PlugCharger-v1"])
 def test_an_episode_does_not_depend_on_what_was_played_before(task: str) -> None:
-    """PegInsertionSide draws its geometry again; PlugCharger's contacts survive a reset without
-    reconfiguration.
+    """PegInsertionSide draws its geometry for each episode; PlugCharger's contacts survive a reset
+    without reconfiguration.
     """
     rng = np.random.default_rng(0)
     actions = [rng.uniform(-1, 1, 7).astype(np.float32) for _ in range(12)]
@@ -103,8 +103,8 @@ def test_an_episode_does_not_depend_on_what_was_played_before(task: str) -> None
 
 
 def test_images_have_the_size_asked_for_and_stand_upright() -> None:
-    """The camera looks back at the robot: what is nearer to it, at larger x, is lower; larger y
-    is further right.
+    """The camera looks back at the robot: points closer to the camera, at larger x, are lower in
+    the image, and larger y is further right.
     """
     with ManiSkill("PushCube-v1", width=160, height=120) as env:
         assert env.contract.cameras == {"base_camera": CameraSpec(height=120, width=160)}
@@ -121,7 +121,7 @@ def test_images_have_the_size_asked_for_and_stand_upright() -> None:
             assert len(cube) > 5
             assert len(target) > 10
             assert target[:, 0].mean() > cube[:, 0].mean()
-            # The cube's y in m, its column.
+            # The cube's y in m, and its column in the image.
             columns.append((obs.info["sim_state"][29], cube[:, 1].mean()))
         columns.sort()
         assert [column for _, column in columns] == sorted(column for _, column in columns)
@@ -148,8 +148,8 @@ def test_translations_are_along_the_bases_axes(push: ManiSkill) -> None:
 
 
 def test_a_positive_rotation_turns_the_tool_negatively(push: ManiSkill) -> None:
-    """ManiSkill scales rotations by their lower bound, -0.1 rad; `ManiSkill`'s docstring says
-    so.
+    """ManiSkill scales rotations by their lower bound, -0.1 rad, as `ManiSkill`'s docstring
+    explains.
     """
     start = push.reset(seed=0)[0].state["xyzrpy"]
     for _ in range(5):
@@ -237,7 +237,7 @@ def test_missing_assets_fail_with_the_command_that_gets_them(
 ) -> None:
     class Keyboard:
         def readline(self) -> str:
-            pytest.fail("waited for an answer on stdin")
+            pytest.fail("the program waited for an answer on stdin")
 
     from mani_skill.utils.assets import DATA_SOURCES
 

@@ -1,4 +1,6 @@
-"""Our ManiSkill against ManiSkill's own way of evaluating, and what the results say about it."""
+"""This package's ManiSkill compared with ManiSkill's own evaluation protocol, and the protocol in
+the results.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ SEEDS = [4, 9]
 
 @pytest.mark.parametrize("task", ["PushCube-v1", "PickCube-v1"])
 def test_success_and_return_are_those_of_maniskills_own_wrapper(task: str) -> None:
-    """The set-up of its guide for CPU simulation, given the actions that our env was."""
+    """ManiSkill's environment is created like in its guide for CPU simulation, and gets the same
+    actions as this package's environment.
+    """
     with ManiSkill(task, **SMALL) as env:
         obs, _ = env.reset(seed=5)
         expert = expert_class(f"maniskill/{task}")(f"maniskill/{task}")
@@ -63,7 +67,8 @@ def test_the_scene_is_rebuilt_for_each_episode() -> None:
             scenes.append(env._env.env.scene)
             lengths.append(float(env._env.env.peg_half_sizes[0, 0]))
         assert scenes[0] is not scenes[1]
-        assert lengths[0] != lengths[1]  # of the peg, which is drawn when the scene is built
+        # lengths of the peg, which are drawn when the scene is built
+        assert lengths[0] != lengths[1]
 
 
 def test_results_say_which_protocol_was_followed_and_what_was_not() -> None:
@@ -81,7 +86,7 @@ def test_results_say_which_protocol_was_followed_and_what_was_not() -> None:
 
 
 def test_a_batch_of_one_plays_what_a_single_environment_plays() -> None:
-    """All that the CPU can show of it: physics there has one environment."""
+    """On the CPU nothing more can be tested, since its physics has only one environment."""
     actions = np.random.default_rng(0).uniform(-1, 1, (5, 7)).astype(np.float32)
     with (
         ManiSkill("PegInsertionSide-v1", **SMALL) as alone,

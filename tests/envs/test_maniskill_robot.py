@@ -1,4 +1,4 @@
-"""Poses in the robot's base frame, and what the control modes say about themselves."""
+"""Poses in the robot's base frame, and the contracts of the control modes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ poses = st.tuples(st.tuples(numbers, numbers, numbers).map(np.array), quaternion
 
 
 def rotation(pose: np.ndarray) -> Rotation:
-    """Of a pose in m and a quaternion wxyz."""
+    """Return the rotation of a pose in m and a quaternion wxyz."""
     return Rotation.from_quat(pose[[4, 5, 6, 3]])
 
 
@@ -51,8 +51,8 @@ def check(base: np.ndarray, tool: np.ndarray) -> None:
     np.testing.assert_allclose(tquat[:3], position, atol=1e-5)
     np.testing.assert_allclose(Rotation.from_quat(tquat[3:]).as_matrix(), turned, atol=1e-5)
     np.testing.assert_allclose(xyzrpy[:3], position, atol=1e-5)
-    # near pitch = +-90 degrees the angles lose half their digits, the rotation they make up does
-    # not
+    # Near pitch = +-90 degrees the angles lose half their digits, but not the rotation that they
+    # describe.
     np.testing.assert_allclose(
         Rotation.from_euler("xyz", xyzrpy[3:]).as_matrix(), turned, atol=2e-3
     )

@@ -1,4 +1,4 @@
-"""PushT by its protocol: what is recorded, and when an episode is solved."""
+"""PushT by its protocol: the recorded values, and when an episode is solved."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from vlagents_ray.envs import EvalEnv, make_env
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Act, Obs
 
-pytest.importorskip("gym_pusht")  # registers the environment
+pytest.importorskip("gym_pusht")  # the import registers the environment
 pytestmark = pytest.mark.sim
 
 NAME = "pusht"
-# Where the agent is and, as `reset_to_state` takes it, the block: 84.6 % of the target is covered.
+# The positions of agent and block, in the form of `reset_to_state`; the block covers 84.6 % of the
+# target.
 BESIDE = [333.0, 236.0, 230.0, 239.0, math.pi / 4]
 PUSHING = Always(270.0, 251.0)  # a target that pushes the block to the left
 
@@ -68,8 +69,8 @@ def test_success_wants_more_than_95_percent_of_the_target_covered(pusht: EvalEnv
 
 
 def test_the_expert_solves_random_beginnings_and_holding_still_does_not() -> None:
-    with make_env("pusht/keypoints") as env:  # the expert does not look at the image
-        for seed in (14, 48):  # those soon solved
+    with make_env("pusht/keypoints") as env:  # the expert does not use the image
+        for seed in (14, 48):  # seeds that are solved soon
             solved = play(env, "pusht/keypoints", "experts.pusht:PushTExpert", seed=seed)
             assert (solved.success_once, solved.ending) == (True, "terminated")
         first, _ = env.reset(seed=3)

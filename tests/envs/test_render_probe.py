@@ -1,4 +1,4 @@
-"""The rendering probe: what it finds, and what it says when there is nothing."""
+"""The rendering probe: its results, and its messages if no renderer works."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def test_moving_to_the_target_is_a_success(reach: EvalEnv) -> None:
     for seed in range(3):
         result = play(reach, NAME, "experts.robotics:FetchReach", seed=seed)
         assert (result.success_at_end, result.ending, result.steps) == (True, "truncated", 50)
-        assert result.episode_return > -10.0  # sparse: -1 in each step away from it
+        assert result.episode_return > -10.0  # sparse reward: -1 in each step away from the target
 
 
 def test_staying_where_it_is_is_none(reach: EvalEnv) -> None:

@@ -1,5 +1,5 @@
-"""What all simulators share, shown with one that simulates nothing; protocols, as results record
-them.
+"""The common features of all simulators, tested with one that simulates nothing; and their
+protocols, as results record them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import entries
 from vlagents_ray.testing import require_wireable
 
-ANY_PROTOCOL = {"tabletop", "gymnasium"}  # our own example, and environments of others by their ids
+# this project's example, and third-party environments by their ids
+ANY_PROTOCOL = {"tabletop", "gymnasium"}
 
 PROTOCOL = BenchmarkProtocol(
     name="Shelf",
@@ -70,7 +71,7 @@ def test_the_page_of_a_benchmark_states_its_protocol(suite: str) -> None:
 
 
 class Shelf(SimulatorEnv):
-    """Is solved by its third step, and breaks where it is told to."""
+    """An environment that is solved by its third step, and fails on request."""
 
     suite, title, packages, cure = "shelf", "Shelf", (), ""
     distributions: ClassVar = ()
@@ -118,7 +119,7 @@ def test_success_ends_an_episode_unless_told_otherwise_and_the_limit_truncates(e
     ]  # fmt: skip
     assert len(env.describe()["protocol"]["deviations"]) == (1 if ends else 2)
     env.reset(seed=0)
-    assert not step(env)[1], "the count begins again"
+    assert not step(env)[1], "the count must begin again"
 
 
 def test_initial_states_go_by_the_option_or_the_seed() -> None:

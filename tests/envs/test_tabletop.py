@@ -1,4 +1,4 @@
-"""The built-in environment: its contract, its determinism, and that its instructions matter."""
+"""The built-in environment: its contract, its determinism, and the effect of its instructions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ from vlagents_ray.testing import check_env
 def play(
     env: Tabletop, seed: int, *, wrong: bool = False, seen: Callable[[Obs], Obs] = lambda obs: obs
 ) -> bool:
-    """Does the expert succeed, following the episode's instruction or another of the same scene?"""
+    """Return whether the expert succeeds when it follows the episode's instruction, or another
+    instruction of the same scene.
+    """
     obs, info = env.reset(seed=seed)
     followed = env.instruction
     if wrong:

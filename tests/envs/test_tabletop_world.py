@@ -1,4 +1,4 @@
-"""How pucks and gripper move, without any drawing."""
+"""The motion of pucks and gripper, without any rendering."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def world(*pucks: Puck, pad: Pad | None = None) -> TabletopWorld:
 
 
 def go(scene: TabletopWorld, x: float, y: float, z: float, opening: float) -> None:
-    """Move straight to (x, y, z) and stop there, as far as the world lets the gripper."""
+    """Move straight to (x, y, z) and stop there, as far as the world allows the gripper to move."""
     for _ in range(40):
         offset = (x - scene.x, y - scene.y, z - scene.z)
         slow = max(1.0, max(map(abs, offset)) / STEP_LIMIT)

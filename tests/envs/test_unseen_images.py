@@ -1,4 +1,6 @@
-"""Simulators render what the policy gets, and nothing else of an evaluation depends on it."""
+"""Simulators render only the images that the policy receives, and no other part of an evaluation
+depends on them.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +32,8 @@ def test_metaworld() -> None:
 @pytest.mark.vulkan
 @pytest.mark.parametrize("task", ["PickCube-v1", "StackCube-v1", "PushT-v1"])
 def test_maniskill(task: str) -> None:
-    """PickCube hides its goal from cameras, StackCube has two of them, PushT draws its reward as
-    a picture.
+    """PickCube hides its goal from cameras, StackCube has two cameras, and PushT computes its
+    reward from an image.
     """
     played(f"maniskill/{task}", **SMALL)
 
@@ -39,7 +41,9 @@ def test_maniskill(task: str) -> None:
 @pytest.mark.vulkan
 @pytest.mark.assets("simpler")
 def test_simpler() -> None:
-    """Its state is made of poses, and its picture of an image and a segmentation."""
+    """Its state consists of poses, and its image is composed of a rendered image and a
+    segmentation.
+    """
     played("simpler/PutCarrotOnPlateInScene-v1")
 
 

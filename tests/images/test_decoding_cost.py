@@ -1,5 +1,5 @@
-"""No file costs much more than an honest one of as many pixels and bytes, nor more than its
-structure told.
+"""No file costs much more than a normal one with as many pixels and bytes, nor more than its
+structure predicts.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
 
 SIZE = 400_000  # bytes of a hostile file whose size can be chosen
 PIXELS = 2**20
-FACTOR = 4.0  # by which a file may be slower than honest ones; without a bound it was 20 to 400
+FACTOR = 4.0  # allowed slowdown relative to normal files; without a bound it was 20 to 400
 ROUNDS = 3
-SLACK = 6 * 2**20  # bytes of buffers in the libraries, and of the interpreter
+SLACK = 6 * 2**20  # bytes of buffers in the libraries and the interpreter
 
 CAMERA = np.kron(
     np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8), np.ones((8, 8, 1), np.uint8)
 )
-# Of as many bytes as a hostile file.
+# As many bytes as in a hostile file.
 NOISE = np.random.default_rng(1).integers(0, 256, (512, 256, 3), np.uint8)
 
 
@@ -41,7 +41,7 @@ def decode_or_refuse(file: bytes) -> None:
 
 
 def cpu_s(file: bytes) -> float:
-    """The shortest time of this thread's CPU in which a file is decoded or rejected."""
+    """Return the shortest CPU time of this thread in which a file is decoded or rejected."""
     times = []
     for _ in range(ROUNDS):
         begun = time.thread_time()
@@ -60,8 +60,8 @@ def saved(image: np.ndarray, kind: str, **options: object) -> bytes:
 
 @pytest.fixture(scope="module")
 def honest() -> dict[str, tuple[bytes, float]]:
-    """Files of cameras, of a megapixel or of as many bytes as the hostile ones, and the CPU time
-    of each, s.
+    """Return camera files with a megapixel or with as many bytes as the hostile ones, and the CPU
+    time of each in s.
     """
     files = {
         "JPEG": jpeg_png.encode_jpeg(CAMERA),
@@ -76,7 +76,7 @@ def honest() -> dict[str, tuple[bytes, float]]:
 
 @pytest.fixture(scope="module")
 def speed(honest: dict[str, tuple[bytes, float]]) -> float:
-    """By how much this machine, at this moment, is slower than the estimates say."""
+    """Return the factor by which this machine is currently slower than the estimates."""
     return max(
         seconds / read_structure(file, PIXELS).decoding_s for file, seconds in honest.values()
     )
@@ -93,7 +93,9 @@ def test_a_hostile_file_takes_no_longer_than_honest_ones(
 
 @pytest.mark.parametrize("name", FILES)
 def test_decoding_takes_no_longer_than_its_estimate(name: str, speed: float) -> None:
-    """By which a server decides where it decodes a file, and whether at all."""
+    """With this estimate, a server decides where it decodes a file, and whether it decodes it at
+    all.
+    """
     file = FILES[name](SIZE)
     try:
         structure = read_structure(file, PIXELS)
@@ -126,7 +128,7 @@ def test_decoding_takes_no_more_memory_than_it_reserves(
     except (MalformedMessage, MessageTooLarge):
         reserved = 0
     try:
-        # The peak begins again at what is in memory now.
+        # This resets the peak to the current memory.
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
         pytest.skip("this system does not let a process reset its peak")
@@ -233,7 +235,7 @@ def test_jpegs_of_other_encoders_are_decoded(options: dict[str, object], grey: b
 
 
 def test_the_files_are_what_their_names_say() -> None:
-    """So that the tests do not pass because each is rejected for another reason."""
+    """Otherwise the tests could pass because each file is rejected for another reason."""
     decoded = set()
     for name, make in FILES.items():
         with contextlib.suppress(MalformedMessage, MessageTooLarge):

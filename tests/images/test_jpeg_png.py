@@ -1,4 +1,6 @@
-"""JPEG keeps as much as the peers', PNG keeps everything, and broken files are rejected by name."""
+"""JPEG's quality equals that of other systems, PNG is lossless, and broken files are rejected with
+their name.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ pixels = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st
 @pytest.mark.parametrize("name", PICTURES)
 def test_a_jpeg_loses_no_more_than_by_vlagents(name: str) -> None:
     image = PICTURES[name]
-    # Both ends of vlagents 0.3: all defaults.
+    # The codec of vlagents 0.3 with all defaults.
     theirs = simplejpeg.decode_jpeg(simplejpeg.encode_jpeg(image))
     assert psnr(image, jpeg_png.decode(jpeg_png.encode_jpeg(image))) >= psnr(image, theirs)
 
@@ -53,7 +55,7 @@ def test_png_is_lossless(image: np.ndarray) -> None:
     assert (structure.height, structure.width) == image.shape[:2]
     np.testing.assert_array_equal(jpeg_png.decode(file), image)
     np.testing.assert_array_equal(jpeg_png._decode_own_png(structure), image)
-    turned = image[::-1, ::-1]  # a view is written as it is seen
+    turned = image[::-1, ::-1]  # a view is written in its own orientation
     np.testing.assert_array_equal(jpeg_png.decode(jpeg_png.encode_png(turned)), turned)
 
 
@@ -73,7 +75,7 @@ def test_a_damaged_png_is_refused_or_harmless(data: st.DataObject) -> None:
     try:
         jpeg_png.decode(bytes(file), max_pixels=4096)
     except (MalformedMessage, MessageTooLarge):
-        return  # rejected by name; anything else fails the test
+        return  # rejected with a named error; any other error fails the test
 
 
 def test_a_png_that_declares_too_much_or_unpacks_to_more_than_that_is_refused() -> None:
@@ -100,8 +102,8 @@ def test_what_is_no_image_is_refused(encode: object, shape: tuple[int, ...]) -> 
 
 @pytest.mark.parametrize("in_chunks", [False, True])
 def test_a_16_bit_grey_png_is_scaled_and_not_clipped(in_chunks: bool) -> None:
-    """Pillow's own conversion makes 255 of all that is over it; of 16-bit colours it takes the
-    upper 8 bits.
+    """Pillow's own conversion clips all values above 255; of 16-bit colours it uses the upper 8
+    bits.
     """
     ramp = np.arange(0, 65536, 64, dtype=np.uint16).reshape(32, 32)
     file = io.BytesIO()
@@ -123,11 +125,13 @@ def test_a_16_bit_grey_png_is_scaled_and_not_clipped(in_chunks: bool) -> None:
 
 
 def test_exif_orientation_turns_nothing() -> None:
-    """As documented: a camera's driver that only marks the file has to turn the pixels itself."""
+    """As documented, a camera's driver that only sets the orientation must rotate the pixels
+    itself.
+    """
     picture = rendered()[:100]
     plain, marked = io.BytesIO(), io.BytesIO()
     exif = Image.Exif()
-    exif[0x0112] = 6  # to be turned by 90 degrees
+    exif[0x0112] = 6  # rotated by 90 degrees
     Image.fromarray(picture).save(plain, "JPEG")
     Image.fromarray(picture).save(marked, "JPEG", exif=exif)
     np.testing.assert_array_equal(

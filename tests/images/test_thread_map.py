@@ -1,5 +1,5 @@
-"""Several images at once: the same results and errors as one by one, with few threads, and none
-for little work.
+"""Several images at once: the same results and errors as one by one, with few threads, and without
+threads for little work.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def test_results_come_in_the_order_of_the_items(count: int, work_s: float) -> No
 
 
 def test_much_work_is_done_by_several_threads() -> None:
-    together = threading.Barrier(4)  # which four threads pass together, or none
+    together = threading.Barrier(4)  # four threads must meet here at the same time
     thread_map.thread_map(lambda _: together.wait(WAIT_S), [0] * 4, MUCH)
 
 
@@ -143,7 +143,7 @@ def test_helpers_keep_off_the_callers_core_but_not_off_all_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     together = threading.Barrier(1 + thread_map._MOST_HELPERS)
-    # Starts all.
+    # This call starts all helpers.
     thread_map.thread_map(lambda _: together.wait(WAIT_S), [0] * together.parties, MUCH)
     may = os.sched_getaffinity(0)
     for core in may:

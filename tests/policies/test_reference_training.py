@@ -30,7 +30,7 @@ CAMERAS = {"tabletop": {"scene": "front", "wrist": "wrist"}}
 
 @pytest.fixture(scope="module")
 def train() -> Any:
-    """The program, by a name that no other program of a test has."""
+    """Import the training program under a name that no other program of a test uses."""
     spec = importlib.util.spec_from_file_location(
         "reference_training", ROOT / "examples/reference/train.py"
     )
@@ -43,8 +43,8 @@ def train() -> Any:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two episodes of each task and strength of disturbance, as in the folder's plan of
-    demonstrations.
+    """Return recordings of two episodes for each task and strength of disturbance in the folder's
+    plan of demonstrations.
     """
     folder = tmp_path_factory.mktemp("data")
     plan = yaml.safe_load((ROOT / "examples/reference/demonstrations/tabletop.yaml").read_text())
@@ -87,7 +87,7 @@ def test_a_training_that_was_cut_off_and_a_second_one_end_with_the_same_weights(
     checkpoint, frames = train.read(data, CAMERAS, tmp_path / "images")
     monkeypatch.setattr(train, "KEEP_EVERY", 3)
     whole = train.fit(checkpoint, frames, 5, 0, tmp_path / "whole.pt")
-    monkeypatch.setattr(train, "SHOWN_EVERY", 2)  # what is shown changes no weight
+    monkeypatch.setattr(train, "SHOWN_EVERY", 2)  # the progress output changes no weight
     other = train.fit(checkpoint, frames, 5, 1, tmp_path / "other.pt")
 
     def kept_and_cut(part: Path, kept: Path) -> None:

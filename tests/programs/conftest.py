@@ -1,5 +1,5 @@
-"""These tests follow what package indexes have today: `make programs` and `make rays` run them each
-night, and no other command.
+"""These tests use the current versions on package indexes. Only `make programs` and `make rays` run
+them, each night.
 """
 
 from __future__ import annotations

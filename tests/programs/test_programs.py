@@ -1,7 +1,8 @@
-"""Programs that others wrote, as PyPI has them, each in an environment of its own, act with a
-policy of ours.
+"""Third-party programs from PyPI, each in a separate environment, act with a policy of this
+package.
 
-The list is in `tests/support/programs.py`. The server is a replica's endpoints in this process.
+The list is in `tests/support/programs.py`. The server consists of a replica's endpoints in this
+process.
 """
 
 from __future__ import annotations
@@ -43,16 +44,16 @@ ROWS = 4
 
 
 def chunk(acts: int, dim: int) -> np.ndarray:
-    """The rows of the act of that number: numbers in [0, 1] that no two rows share, exact in
-    float32.
+    """Return the rows of the act with that number. The values in [0, 1] are exact in float32, and
+    differ between rows.
     """
     return (np.arange(ROWS * dim, dtype=np.float32).reshape(ROWS, dim) + 64 * (acts - 1)) / 1024
 
 
 class Witness(Agent):
-    """A policy that notes what it sees; its gripper is 1 when open."""
+    """A policy that records its observations. Its gripper is 1 when open."""
 
-    # By all sessions: with the instruction and the act's number.
+    # Observations of all sessions, with the instruction and the act's number.
     seen: ClassVar[list[tuple[Obs, str | None, int]]] = []
 
     def __init__(self, dim: int) -> None:
@@ -76,7 +77,7 @@ class Witness(Agent):
 
 @contextmanager
 def serving(dim: int, dialects: Mapping[str, Any]) -> Iterator[int]:
-    """The port of a replica with this dialect on its own port, or of a gateway with it."""
+    """Yield the port of a replica with this dialect on its own port, or of a gateway with it."""
     Witness.seen.clear()
     with ExitStack() as stack:
         replicas = Replicas([Witness(dim)])
@@ -124,7 +125,7 @@ def test_it_executes_the_policys_actions(name: str) -> None:
         assert sorted(obs.cameras) == sorted(said["cameras"])
         for image in obs.cameras.values():
             middle = image[image.shape[0] // 2, image.shape[1] // 2].astype(int)
-            # One sends JPEG's pixels.
+            # One program sends JPEG images.
             assert np.abs(middle - clients.picture(number * program.used)[0, 0]).max() <= 1
         assert bool(obs.state) == bool(said["state"])
         for key, part in said["state"].items():
@@ -135,7 +136,7 @@ def test_it_executes_the_policys_actions(name: str) -> None:
 
 
 def run_example(name: str, *options: str, **variables: str) -> str:
-    """Run an example of openpi to its end with the packages that it pins; return its output."""
+    """Run an example of openpi to its end with its pinned packages, and return its output."""
     program = PROGRAMS[f"openpi examples/{name}"]
     folder = Path(os.environ["OPENPI_SRC"]) / "examples" / name
     theirs = ["--requirement", str(folder / "requirements.txt"), *program.requirements]
@@ -150,7 +151,7 @@ def run_example(name: str, *options: str, **variables: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     acts = [acts for _, _, acts in Witness.seen]
-    assert acts == list(range(1, len(acts) + 1))  # one session
+    assert acts == list(range(1, len(acts) + 1))  # a single session
     assert all(
         not np.array_equal(one.cameras["front"], other.cameras["front"])
         for (one, _, _), (other, _, _) in pairwise(Witness.seen)
@@ -167,7 +168,7 @@ def test_openpis_simple_client_measures_the_server(env: str, preset: str, dim: i
     with serving(dim, {"openpi": {"mapping": preset}}) as port:
         options = ("--host", "127.0.0.1", "--port", str(port), "--env", env, "--num-steps", "5")
         assert "client_infer_ms" in run_example("simple_client", *options)
-    assert len(Witness.seen) == 7  # two calls warm it up
+    assert len(Witness.seen) == 7  # two warm-up calls are included
 
 
 @pytest.mark.source("OPENPI_SRC")

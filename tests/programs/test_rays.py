@@ -1,4 +1,4 @@
-"""A server with minor versions of Ray, those that are allowed and others: `make rays`."""
+"""A server with minor versions of Ray, both allowed and other ones: `make rays`."""
 
 from __future__ import annotations
 

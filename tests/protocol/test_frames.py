@@ -1,4 +1,4 @@
-"""Frames: what goes in comes out, and nothing else gets in."""
+"""Frames: decoding restores the encoded values, and rejects everything else."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from vlagents_ray.protocol.messages import (
 
 
 def decode_request(frame: Buffer, limits: MessageLimits = DEFAULT_LIMITS) -> Request:
-    """The only request of a frame; raises why it is rejected."""
+    """Return the only request of a frame, or raise the reason of its rejection."""
     [request] = read_requests(frame, Budget(limits))
     if isinstance(request, Reply):
         assert request.error is not None
@@ -90,10 +90,11 @@ def same(a: object, b: object) -> bool:
         return isinstance(b, dict) and a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
     if isinstance(a, (list, tuple)):
         return isinstance(b, (list, tuple)) and len(a) == len(b) and all(map(same, a, b))
-    return type(a) is type(b) and (a == b or repr(a) == repr(b) == "nan")  # which equals nothing
+    # NaN, which is not equal to itself
+    return type(a) is type(b) and (a == b or repr(a) == repr(b) == "nan")
 
 
-# Names of its own parameters are not accepted as options of a reset.
+# Names of the method's own parameters are not accepted as options of a reset.
 reset_options = infos.filter(lambda options: not {"self", "obs", "instruction"} & options.keys())
 
 
@@ -211,7 +212,7 @@ def test_a_damaged_frame_is_refused_or_harmless_and_a_truncated_one_malformed() 
                 mutated(choose, choose.choice(frames)), Budget(DEFAULT_LIMITS)
             )
         except VLAgentsError:
-            refused += 1  # by name; anything else fails the test
+            refused += 1  # rejected with a named error; any other error fails the test
             continue
         refused += isinstance(answer, Reply)
     assert sent / 3 < refused < sent
@@ -228,7 +229,7 @@ def _frame(header: dict, *blobs: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("header", "blobs", "error"),
     [
-        ({"op": "act"}, (), MalformedMessage),  # no observation
+        ({"op": "act"}, (), MalformedMessage),  # without an observation
         ({"op": "fly", "obs": {}}, (), MalformedMessage),
         ({"op": "act", "obs": {}, "extra": 1}, (), MalformedMessage),
         ({"op": "act", "obs": {"camera": {}}}, (), MalformedMessage),
@@ -438,7 +439,7 @@ def test_replies_that_share_a_frame_come_back_in_order() -> None:
         *(
             ({"op": of_a_replica}, MalformedMessage)
             for of_a_replica in sorted({*INNER_OPS} - {*OPS})
-        ),  # two carry pickles
+        ),  # two of the files contain pickles
     ],
 )
 def test_fields_of_a_request_are_checked(change: dict, error: type[VLAgentsError]) -> None:

@@ -1,5 +1,5 @@
-"""The golden files of the protocol are what the codec of this package writes and reads, and its
-schema's examples.
+"""The codec of this package writes and reads the golden files of the protocol, and the schema's
+examples are valid.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ def of(*kinds: str) -> Any:
 
 
 def require_valid(document: Any, name: str) -> None:
-    """Raise unless the document is one of that name in the schema."""
+    """Raise unless the document matches the schema of that name."""
     jsonschema.Draft202012Validator({"$ref": f"#/$defs/{name}", "$defs": SCHEMA["$defs"]}).validate(
         document
     )
 
 
 def plain(means: Any) -> Any:
-    """A meaning in which an image file is its pixels, as the reader of requests gives them."""
+    """Return a meaning whose image files are replaced by pixels, like in decoded requests."""
     if isinstance(means, dict) and means.get("$") == "image":
         pixels = means.get("pixels")
         return (
@@ -98,7 +98,7 @@ def test_the_codec_reads_what_a_request_says_and_writes_its_bytes(frame: golden.
 @of("replies")
 def test_the_codec_reads_what_a_reply_says_and_writes_its_bytes(frame: golden.Golden) -> None:
     replies = decode_replies(frame.data)
-    # As an unknown code is read.
+    # An unknown code is read as "internal".
     said = json.loads(json.dumps(frame.meaning).replace('"melted"', '"internal"'))
     assert [golden.of_reply(reply) for reply in replies] == said
     if frame.by_codec:
@@ -168,7 +168,7 @@ REFUSED_ACTS = [
 
 
 class Chunks(Agent):
-    """A chunk, or an error."""
+    """A policy that returns a chunk or raises an error."""
 
     @property
     def contract(self) -> Contract:

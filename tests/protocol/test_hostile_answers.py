@@ -1,4 +1,4 @@
-"""An answer of a hostile server costs a robot's computer little memory; tests/clients has the
+"""An answer of a hostile server takes little memory on a robot's computer; tests/clients tests the
 other languages.
 """
 

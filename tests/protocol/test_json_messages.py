@@ -1,4 +1,6 @@
-"""JSON, with separate images as curl sends them, and with values as a recording keeps them."""
+"""JSON messages, with separate images like curl sends them, and with values in the form of
+recordings.
+"""
 
 from __future__ import annotations
 

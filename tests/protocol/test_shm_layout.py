@@ -1,4 +1,4 @@
-"""Acts without headers: what goes in comes out, and nothing else gets in."""
+"""Acts without headers: decoding restores the encoded values, and rejects everything else."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_garbage_is_refused_by_name(data: bytes) -> None:
         ["s", "robot", [["a", [4, 4, 4]]], []],
         ["s", "robot", [["a", [4, -4, 3]]], []],
         ["s", "robot", [["a", [2**20, 2**20, 3]]], []],
-        ["s", "robot", [["a", [400, 400, 3]]], []],  # more than the memory holds
+        ["s", "robot", [["a", [400, 400, 3]]], []],  # more than the memory contains
         ["s", "robot", [["a", [4, 4, 3]]] * 17, []],
         ["s", "robot", [], [["a", [10_000]]]],
         ["s", "robot", [], [[["a"], [3]]]],
@@ -274,8 +274,8 @@ class WritersAndReaders(RuleBasedStateMachine):
     """One connection with four layouts at most, whose messages may be lost or rejected on either
     side.
 
-    As in `ShmTransport`, a client whose message was not sent, or was rejected before it was read,
-    begins its layouts again, while the server remembers those that it has read.
+    Like in `ShmTransport`, a client begins its layouts again if its message was not sent, or was
+    rejected before it was read. The server remembers the layouts that it has read.
     """
 
     def __init__(self) -> None:
@@ -313,14 +313,14 @@ class WritersAndReaders(RuleBasedStateMachine):
         sessions=st.lists(st.integers(0, 4), min_size=3),
     )
     def send_in_vain(self, sides: list[int], sessions: list[int]) -> None:
-        """Over the rate, or not sent in time."""
+        """Write a message that is over the rate, or that is not sent in time."""
         self.written(sides, sessions)
         self.writer = ShmWriter()
 
     @rule(side=st.integers(1, 3), session=st.integers(0, 4))
     def be_refused_behind_the_layout(self, side: int, session: int) -> None:
-        """The second act of a message is wrong: the layout of the first has been read, and the
-        client starts over.
+        """Write a message whose second act is wrong: the server has read the layout of the first
+        act, and the client starts over.
         """
         _, written = self.written([side], [session])
         if written is None:
@@ -359,7 +359,7 @@ def test_a_reader_takes_no_layout_beyond_the_limit_and_no_message_of_too_many_ac
 
 @pytest.mark.parametrize("name", ["", "x" * 129, "a\nb", "x" * 100_000])
 def test_names_have_the_limits_of_a_frame_in_layouts_also(name: str) -> None:
-    """1,024 layouts with names of a message's size each would hold 256 MB."""
+    """1,024 layouts with names as long as a message would take 256 MB."""
     text = json.dumps(["s", "robot", [], [[name, [1]]]]).encode()
     item = ITEM.pack(0, len(text), -1, float("nan"), float("nan"), b"")
     with pytest.raises(InvalidInput, match="named"):

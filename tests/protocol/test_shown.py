@@ -1,5 +1,5 @@
-"""Texts of errors that show a value of the network: their length and time do not depend on the
-value.
+"""Error texts that contain a value from the network: their length and the time to write them do not
+depend on the value.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FROM_THE_NETWORK = (
     PLUGINS / "vlagents_ray_dialects/vlagents_ray_dialects",
     PLUGINS / "vlagents_ray_robot/vlagents_ray_robot/ros",
 )
-ERRORS = ("error", "full", "problem")  # names of exceptions, whose texts are bounded already
+ERRORS = ("error", "full", "problem")  # names of exceptions whose texts are already bounded
 
 ARRAY = np.random.default_rng(0).random(1000)
 VALUES = st.recursive(
@@ -69,7 +69,7 @@ def test_a_large_value_takes_no_time(value: object) -> None:
     begun = time.process_time()
     for _ in range(100):
         assert len(shown(value)) <= 80
-    assert (time.process_time() - begun) / 100 < 2e-3  # repr takes 10 ms and more for each
+    assert (time.process_time() - begun) / 100 < 2e-3  # repr takes at least 10 ms for each
 
 
 @pytest.mark.parametrize(
@@ -88,8 +88,8 @@ def test_a_small_value_is_written_as_it_is(value: object, text: str) -> None:
 
 
 def _cut_after_it_was_written(path: Path) -> Iterator[int]:
-    """Lines with `str(x)[:n]`, `repr(x)[:n]` or `{x!r:.n}`, which write all of a value, and cut
-    the text then.
+    """Return lines with `str(x)[:n]`, `repr(x)[:n]` or `{x!r:.n}`, which write a whole value before
+    they cut the text.
     """
     for node in ast.walk(ast.parse(path.read_text())):
         if (

@@ -1,5 +1,5 @@
-"""Our reader of WebSocket frames against that of `websockets`: the same events, answers and
-refusals, for any bytes.
+"""This package's reader of WebSocket frames compared with that of `websockets`: the same events,
+answers and errors, for any bytes.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ def opened(*, is_server: bool) -> Protocol:
         else ClientProtocol(parse_uri("ws://a/"), max_size=LIMIT)
     )
     protocol.state = State.OPEN
-    protocol.parser = Protocol.parse(protocol)  # the one so far reads a handshake
+    protocol.parser = Protocol.parse(protocol)  # the parser so far reads a handshake
     next(protocol.parser)
     return protocol
 
 
 def outcome(protocol: Protocol) -> tuple[object, ...]:
-    """Return everything that is seen of a protocol after it has received bytes."""
+    """Return the visible state of a protocol after it has received bytes."""
     events = [
         (one.opcode, bytes(one.data), one.fin)
         for one in protocol.events_received()
@@ -66,8 +66,8 @@ def outcome(protocol: Protocol) -> tuple[object, ...]:
 
 
 def serialized(head: int, data: bytes, *, mask: bytes, length: int = 0) -> bytes:
-    """Return a frame with any first byte; its length takes at least `length` bytes after the
-    second one.
+    """Return a frame with any first byte. Its length field takes at least `length` bytes after the
+    second byte.
     """
     size = len(data)
     bit = 0x80 * bool(mask)
@@ -84,12 +84,12 @@ BINARY, PART, LAST, PING, PONG, CLOSE = 0x82, 0x02, 0x80, 0x89, 0x8A, 0x88
 HEADS = st.sampled_from([*[BINARY] * 8, PART, LAST, 0x00, 0x81, PING, PONG, CLOSE]) | st.integers(
     0, 255
 )
-# Or so many zeros.
+# An integer stands for this number of zeros.
 DATA = st.binary(max_size=130) | st.sampled_from([b"\x03\xe8bye", 1025, 70_000, LIMIT, LIMIT + 1])
 FRAMES = st.tuples(
     HEADS, DATA, st.sampled_from([True] * 9 + [False]), st.sampled_from([0] * 8 + [2, 8])
 )
-NO_MASK = bytes(4)  # our client's, which changes nothing
+NO_MASK = bytes(4)  # the mask of this package's client, which changes nothing
 
 
 @settings(max_examples=many(400))
@@ -119,7 +119,7 @@ NO_MASK = bytes(4)  # our client's, which changes nothing
 @example(True, [(BINARY, b"not masked", False, 0)], b"", [], MASK)
 @example(False, [(BINARY, b"masked", False, 0)], b"", [], MASK)
 @example(True, [], b"\x82\x01a1234", [], MASK)  # as long as a masked frame
-@example(False, [], b"\x82\x81a", [], MASK)  # as long as one without a mask
+@example(False, [], b"\x82\x81a", [], MASK)  # as long as an unmasked frame
 @example(True, [(0xC2, b"compressed", True, 0)], b"", [], MASK)
 @example(True, [(BINARY, b"a long length", True, 8)], b"", [], MASK)
 def test_any_bytes_have_the_same_effect_as_on_the_parser_of_websockets(
@@ -137,7 +137,7 @@ def test_any_bytes_have_the_same_effect_as_on_the_parser_of_websockets(
     ours, received = connected(is_server=is_server)
     theirs = opened(is_server=is_server)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(secrets, "token_bytes", bytes)  # of the masks of a client's answers
+        patched.setattr(secrets, "token_bytes", bytes)  # the random masks of a client's answers
         for piece in cut(pieces, sizes):
             received.parse(piece)
             theirs.receive_data(bytes(piece))
@@ -148,8 +148,8 @@ def test_any_bytes_have_the_same_effect_as_on_the_parser_of_websockets(
 
 
 def cut(pieces: Iterable[bytes], sizes: list[int]) -> Iterable[memoryview]:
-    """Yield the pieces, or parts of them that end at multiples of one of `sizes`, in memory that
-    each reuses.
+    """Yield the pieces, or parts of them that end at multiples of one of `sizes`, always in the
+    same memory.
     """
     memory = memoryview(bytearray(2**20))
     for number, piece in enumerate(pieces):
@@ -189,7 +189,7 @@ def test_the_rest_of_a_frame_is_not_taken_for_a_frame() -> None:
     protocol, received = connected()
     message = Frame(Opcode.BINARY, b"a message that looks like a frame").serialize(mask=True)
     received.parse(memoryview(bytes([0x82, 0x80 | len(message), 0, 0, 0, 0])))
-    assert received.size == 0  # the parser has read the head
+    assert received.size == 0  # the parser has already read the head
     received.parse(memoryview(message))
     assert [event.data for event in protocol.events_received() if isinstance(event, Frame)] == [
         message

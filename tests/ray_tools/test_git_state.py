@@ -1,4 +1,4 @@
-"""Which code runs, as git knows it."""
+"""The state of the running code in git."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from vlagents_ray.ray_tools.git_state import code_in, code_of
 
 @pytest.fixture
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """One commit with a module in it, importable; the cache of what the process has seen is
-    empty.
+    """Create a repository with one commit and an importable module, and empty the cache of seen
+    states.
     """
     folder = tmp_path / "repository"
     folder.mkdir()

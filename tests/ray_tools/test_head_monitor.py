@@ -1,4 +1,4 @@
-"""The driver notices that the cluster's head is gone, before Ray ends the driver for it."""
+"""The driver notices the loss of the cluster's head before Ray ends the driver."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vlagents_ray.ray_tools.private import node_of_this_process
 
 @pytest.fixture
 def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
-    """In place of the head's socket: bound, so that nobody else gets its port, and answering
+    """Replace the head's socket by a bound one, so that no other process gets its port; it answers
     once it listens.
     """
     with socket.socket() as bound:
@@ -58,7 +58,9 @@ def test_it_is_not_asked_at_every_turn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def node(silent: socket.socket, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SimpleNamespace:
-    """Ray's record of this machine, whose daemon listens as the test wants; the head answers."""
+    """Return Ray's record of this machine, whose daemon listens when the test requests it; the head
+    answers.
+    """
     silent.listen()
     node = SimpleNamespace(raylet_socket_name=str(tmp_path / "raylet"))
     monkeypatch.setattr(head_monitor, "node_of_this_process", lambda: node)
@@ -73,7 +75,7 @@ def test_the_end_of_the_daemon_here_is_noticed_though_the_head_answers(
         daemon.listen()
         watched = HeadMonitor("continue with --resume")
         assert watched.answers()
-    assert Path(node.raylet_socket_name).exists()  # as after kill -9
+    assert Path(node.raylet_socket_name).exists()  # the same state as after kill -9
     with pytest.raises(ClusterLost, match=r"raylet, has ended; continue with --resume"):
         watched.answers()
 
@@ -95,7 +97,7 @@ def test_a_head_that_this_process_started_is_not_waited_for(
 def test_a_process_that_is_still_being_connected_has_no_node_yet(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ray has its record before, and starts a second Ray for whoever asks it for anything then."""
+    """Ray has its record earlier, and would start a second Ray for any call at that time."""
     worker = SimpleNamespace(node="a node", connected=False)
     monkeypatch.setattr("ray._private.worker.global_worker", worker)
     assert node_of_this_process() is None

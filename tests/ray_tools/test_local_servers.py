@@ -1,4 +1,4 @@
-"""Which servers of this user run on this machine, as a program finds out that wants to join one."""
+"""The servers of this user on this machine, as a program finds them that wants to join one."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ from vlagents_ray.ray_tools.session import LocalServer, announce, local_servers
 
 @pytest.fixture(autouse=True)
 def alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Of the processes of this machine those alone are looked at whose Ray is in this test's
-    folder.
-    """
+    """Let the search find only processes whose Ray is in this test's folder."""
     found = Path.glob
 
     def ours(self: Path, pattern: str) -> Iterator[Path]:
@@ -58,7 +56,7 @@ def raylet(folder: Path, ray_address: str, **environment: str) -> Iterator[None]
         words, executable="/bin/sh", env={MARK: str(folder)} | environment, stdin=subprocess.PIPE
     ) as process:
         try:
-            # Which the kernel sets after Popen has returned.
+            # The kernel sets this file after Popen has returned.
             wait_for(Path(f"/proc/{process.pid}/cmdline").read_bytes)
             yield
         finally:
@@ -92,7 +90,7 @@ def test_a_server_that_is_starting_is_not_there_yet_and_one_that_was_killed_no_m
             "127.0.0.1:1",
         )
     assert local_servers() == []
-    with raylet(alone / "a", "127.0.0.1:2"):  # of another Ray
+    with raylet(alone / "a", "127.0.0.1:2"):  # the daemon of another Ray
         assert local_servers() == []
 
 
@@ -115,7 +113,7 @@ def test_of_several_servers_one_is_named_by_its_url_or_its_application(
             ConfigError, match=r"expected the URL or an application .*8000 \(noop\).*, got 'act'"
         ):
             join("act")
-        # So that it says which one it found, and goes no further.
+        # Then the program prints the server that it found, and stops.
         monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
         for name in (
             "pi0",

@@ -1,4 +1,6 @@
-"""The adapter to Ray states the private names that are used, and reports those that a Ray lacks."""
+"""The adapter to Ray lists the private names that it uses, and reports those that a Ray version
+lacks.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What a killed driver leaves is cleaned up; of what an orderly one leaves, its HAProxy."""
+"""The reaper cleans up the remains of a killed driver, and after an orderly exit the remaining
+HAProxy.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,8 @@ with reaped(Path(folder), lost=ConnectionError):
 
 
 def test_the_reaper_needs_no_package_that_only_its_driver_finds(tmp_path: Path) -> None:
-    # -S: not even where the package is installed, as in an environment that finds it by PYTHONPATH
+    # -S hides site-packages, even where the package is installed, like in an environment that finds
+    # it through PYTHONPATH
     command = [sys.executable, "-I", "-S", reaper.__file__, str(tmp_path / "cluster")]
     ran = subprocess.run(command, check=False, input="", capture_output=True, text=True, timeout=60)
     assert (ran.returncode, ran.stderr) == (0, "")

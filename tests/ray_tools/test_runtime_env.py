@@ -1,5 +1,5 @@
-"""Ray writes runtime environments where every user of the machine can read them: no secret may
-be in one.
+"""Ray writes runtime environments to files that every user of the machine can read, so they must
+not contain secrets.
 """
 
 from __future__ import annotations

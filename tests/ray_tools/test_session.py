@@ -1,4 +1,4 @@
-"""Joining a Ray cluster that runs already."""
+"""Joining a running Ray cluster, and starting a separate one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vlagents_ray.evaluate.workers.cluster import ray_cluster
 from vlagents_ray.ray_tools import session as joining
 from vlagents_ray.ray_tools.session import joined, ray_folder
 
-# A start-up file of Python's that holds one of Ray's helpers back for longer than Ray's daemon
+# A start-up file of Python that delays one of Ray's helper processes for longer than Ray's daemon
 # waits for it.
 SLOW = """
 import os, time
@@ -78,7 +78,8 @@ def test_a_cluster_that_was_lost_is_not_taken_for_the_one_that_this_process_join
         ("http://127.0.0.1:8000", None, "http://127.0.0.1:8000"),
         ("http://127.0.0.1:8000", "198.18.0.9:6379", "http://127.0.0.1:8000"),
         ("auto", None, None),
-        ("auto", "198.18.0.9:6379", "Ray's"),  # by `ray start`, which says where
+        # for a cluster of `ray start`, which prints the address
+        ("auto", "198.18.0.9:6379", "Ray's"),
     ],
 )
 def test_the_url_of_a_server_stands_for_its_ray_and_so_does_auto_where_no_other_was_started(
@@ -95,7 +96,7 @@ def test_the_url_of_a_server_stands_for_its_ray_and_so_does_auto_where_no_other_
 
 
 def slow_helpers(folder: Path, monkeypatch: pytest.MonkeyPatch, slow: int) -> Path:
-    """The first `slow` of them; returns a file of as many bytes as were started."""
+    """Delay the first `slow` helpers; return a file with one byte for each started helper."""
     asked = folder / "asked"
     (folder / "sitecustomize.py").write_text(SLOW.format(asked=str(asked), slow=slow))
     monkeypatch.setenv("PYTHONPATH", f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
@@ -112,7 +113,7 @@ def test_a_machine_that_is_slow_to_start_ray_gets_another_attempt(
         assert ray.get(ray.put(5)) == 5
         [node] = ray.nodes()
         assert joining.cluster_id() == node["NodeID"]
-    # The third where the machine is as slow as that by itself.
+    # A third attempt is possible on a machine that is slow by itself.
     assert asked.read_text() in ("xx", "xxx")
     assert "attempt 2 of 3" in caplog.text
     assert re.search("Ray's daemon: .*Timed out waiting for file .*agent", caplog.text)
@@ -136,7 +137,9 @@ def test_a_machine_that_is_slow_to_start_ray_gets_another_attempt(
 def test_a_ray_that_does_not_start_leaves_nothing(
     error: Exception, said: str, attempts: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once its processes are there; what is wrong with an option is not tried again."""
+    """The failure occurs after Ray's processes have started; a wrong option causes no further
+    attempt.
+    """
     failures: list[object] = []
 
     def fail(*_: object) -> None:
@@ -144,11 +147,11 @@ def test_a_ray_that_does_not_start_leaves_nothing(
         raise error
 
     monkeypatch.setattr("ray._private.services.get_node", fail)
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # where the logs stay
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # the logs remain there
     before = set(psutil.Process().children(recursive=True))
     with pytest.raises(ValueError, match=said), joined("local", num_cpus=1):
         pytest.fail("started")
-    # On a machine that is slow by itself, an attempt may end before it asks for its node.
+    # On a slow machine, an attempt may end before it asks for its node.
     assert 1 <= len(failures) <= attempts
     assert not ray.is_initialized()
     _, left = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - before, 30)
@@ -156,7 +159,9 @@ def test_a_ray_that_does_not_start_leaves_nothing(
 
 
 def test_a_folder_that_ray_may_not_write_is_said_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """/tmp/ray of another user's: there are no logs then, and no other attempt would do better."""
+    """/tmp/ray may belong to another user. Then there are no logs, and another attempt would also
+    fail.
+    """
     tries: list[object] = []
 
     def refuse(*_: object) -> None:
@@ -171,12 +176,12 @@ def test_a_folder_that_ray_may_not_write_is_said_as_it_is(monkeypatch: pytest.Mo
 
 
 def programs() -> set[str]:
-    """The words of the command lines of this process's children, without folders."""
+    """Return the command lines of this process's children, without folders."""
     return {Path(word).name for one in psutil.Process().children() for word in words(one)}
 
 
 def session() -> Path:
-    """The folder of this process's Ray."""
+    """Return the session folder of this process's Ray."""
     return Path(ray._private.worker.global_worker.node.get_session_dir_path())
 
 
@@ -184,8 +189,8 @@ def session() -> Path:
 def test_a_ray_of_ones_own_is_in_a_folder_that_no_other_user_enters_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its own folders are everybody's to write to: whose sockets and logs are in them would be a
-    matter of luck. It has no autoscaler, no log monitor and no dashboard.
+    """Every user may write to Ray's default folders, so their sockets and logs could belong to
+    others. The separate Ray has no autoscaler, no log monitor and no dashboard.
     """
     with ray_folder_of_test() as place:
         place.chmod(0o755)
@@ -209,7 +214,7 @@ def test_a_ray_of_ones_own_is_in_a_folder_that_no_other_user_enters_and_leaves_n
 def test_a_folder_whose_name_is_too_long_for_sockets_is_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of Ray's, and of HAProxy's, each of which has the number of its process in its name."""
+    """The names of Ray's and HAProxy's sockets contain the number of the process."""
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path / ("x" * 40)))
     with ray_folder() as folder:
         assert folder.parent == Path("/tmp")
@@ -217,8 +222,8 @@ def test_a_folder_whose_name_is_too_long_for_sockets_is_replaced(
     assert not folder.exists()
 
 
-# Starts two clusters after each other, and lists what other accounts of the machine could read of
-# their tokens.
+# Starts two clusters one after the other, and lists the files with their tokens that other accounts
+# of the machine could read.
 OPEN_HOME = """
 import os, stat, sys
 from pathlib import Path
@@ -252,10 +257,10 @@ print("closed to others")
 def test_the_token_of_a_started_cluster_is_its_own_and_closed_to_other_accounts(
     tmp_path: Path,
 ) -> None:
-    """Whoever reads the token runs code as this user, and a home folder that others may enter is
-    usual.
+    """A process with the token can run code as this user, and home folders are often readable by
+    other users.
     """
-    with tempfile.TemporaryDirectory() as folder:  # short, for the names of Ray's sockets
+    with tempfile.TemporaryDirectory() as folder:  # short, because of the names of Ray's sockets
         Path(folder).chmod(0o755)
         home, files = Path(folder, "home"), Path(folder, "t")
         for place in (home, files):

@@ -118,7 +118,7 @@ class FakeCuda:
                 return to(tensor, *args, non_blocking=non_blocking, **kwargs)
             if not non_blocking or tensor.data_ptr() not in pinned:
                 raise AssertionError(
-                    "the copy waits for its stream: want pinned memory, and non_blocking"
+                    "the copy waits for its stream: expected pinned memory and non_blocking"
                 )
             made = self.tensor(torch.full_like(tensor, _GARBAGE), self._index(device))
             stream = self.current_stream(device)

@@ -248,7 +248,7 @@ def with_tables(file: str, text: str) -> str:
     for name, rows in TABLES[file].items():
         begin, end = f"<!-- table: {name} -->", "<!-- /table -->"
         if text.count(begin) != 1:
-            raise ValueError(f"{file}: want {begin} once, and {end} after its table")
+            raise ValueError(f"{file}: expected {begin} once, and {end} after its table")
         new = "\n".join([begin, *rows, end])
         text = re.sub(f"{begin}.*?{end}", lambda _, new=new: new, text, flags=re.DOTALL)
     return text

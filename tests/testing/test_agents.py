@@ -1,4 +1,4 @@
-"""Each check of `check_agent` fails for a policy that is broken in just that way, and says where
+"""Each check of `check_agent` fails for a policy with exactly this fault, and names the place where
 two values differ.
 """
 
@@ -21,7 +21,9 @@ CONTRACT = Contract(state={"joints": StateSpec(2)}, action=ActionSpec(dim=2))
 
 
 class GoodAgent(Agent):
-    """Stateful, seeded, looks at its observation and instruction: the parent of all broken ones."""
+    """A policy with state and seeds that uses its observation and instruction; the parent of all
+    faulty ones.
+    """
 
     contract = CONTRACT
 
@@ -77,7 +79,7 @@ class SharesItsCount(GoodAgent):
 
 
 def with_reset(change: Callable[[GoodAgent, Obs], object]) -> type[GoodAgent]:
-    """An agent whose reset ends with this change, and returns its result."""
+    """Return a policy whose reset ends with this change, and returns its result."""
 
     class Changed(GoodAgent):
         def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> Any:
@@ -118,7 +120,7 @@ class OneActionBuffer(GoodAgent):
 
 
 class ActsByItself(GoodAgent):
-    """Forgets the sessions and asks the shared agent."""
+    """A policy that ignores the sessions and calls the shared agent."""
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         return [self.act(one) for one in obs]
@@ -135,7 +137,7 @@ class PreparesOtherwise(GoodAgent):
 
 
 class Prepares(GoodAgent):
-    """Gives `act` what it computes in `prepare`."""
+    """A policy that uses the result of `prepare` in `act`."""
 
     def prepare(self, obs: Obs) -> Any:
         return {"joints": obs.state["joints"] * 1, "text": self.told}
@@ -145,13 +147,15 @@ class Prepares(GoodAgent):
 
 
 class Tokenizer:
-    """Keeps its padding as state, as fast tokenizers do; padded texts have five letters."""
+    """A tokenizer that keeps its padding as state, like fast tokenizers. Padded texts have five
+    letters.
+    """
 
     padded = False
 
     def __call__(self, text: str, *, padded: bool) -> list[str]:
         self.padded = padded
-        time.sleep(1e-4)  # another thread may call it
+        time.sleep(1e-4)  # another thread may call the tokenizer
         return [*text, *(" " * (5 - len(text)) if self.padded else "")]
 
 
@@ -221,7 +225,7 @@ class ParsesItInAct(ParsesItsInstruction):
 
 class SleepsForEver(GoodAgent):
     def sleep(self) -> None:
-        """Free memory that nothing allocates again."""
+        """Free memory that is never allocated again."""
 
 
 class AgentClosesOnce(GoodAgent):

@@ -1,4 +1,4 @@
-"""Each check of `check_env` fails for an environment that is broken in just that way."""
+"""Each check of `check_env` fails for an environment with exactly this fault."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CONTRACT = Contract(
 
 
 class GoodEnv(EvalEnv):
-    """A point that moves, seen on a small image: the parent of all broken ones."""
+    """A moving point in a small image; the parent of all faulty environments."""
 
     max_steps = truncated_at = 6
     contract, instruction = CONTRACT, "go right"
@@ -65,7 +65,7 @@ class GoodEnv(EvalEnv):
 
 
 class CarriesOver(GoodEnv):
-    """Its dynamics depend on how many episodes there were."""
+    """An environment whose dynamics depend on the number of episodes."""
 
     episodes = 0
 

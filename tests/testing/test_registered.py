@@ -1,4 +1,4 @@
-"""The public suites, over every registered name."""
+"""The public test suites, for each registered name."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CHECKED_ELSEWHERE = {
     "aloha",
     "upstream",
 }
-VARIANTS = {  # variants of envs that are not tried by their own name alone
+VARIANTS = {  # further variants of environments to test, in addition to the plain name
     "gymnasium": ["gymnasium/Pendulum-v1", "gymnasium/gym_pusht/PushT-v0"],
     "pusht": ["pusht", "pusht/keypoints"],
 }
@@ -56,7 +56,7 @@ def test_every_registered_env_passes(suite: str) -> None:
 )
 def test_every_registered_policy_passes(name: str) -> None:
     cls = policy_class(name)
-    # Their own tests do.
+    # The families' own tests run the suites for these policies.
     if issubclass(cls, ModelPolicy) and cls.Config.model_fields["checkpoint"].is_required():
         with pytest.raises(ConfigError, match="checkpoint"):
             cls.from_config({})

@@ -1,4 +1,4 @@
-"""A recording of Rerun opens with its own reader, and holds what was sent."""
+"""A recording for Rerun opens with Rerun's own reader, and contains the sent data."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vlagents_ray.serve.ports import free_port
 from vlagents_ray.viewers import ViewerFrame, open_viewer
 
 TICKS = 6
-_RERUN = {  # component -> what it is called here
+_RERUN = {  # component -> its name in this test
     "Scalars:scalars": "values",
     "EncodedImage:blob": "file",
     "TextLog:text": "text",
@@ -35,8 +35,8 @@ _RERUN = {  # component -> what it is called here
 
 
 def read_rrd(path: Path) -> dict[str, dict[int | None, Any]]:
-    """What a `.rrd` file says: entity -> tick (None: always) -> numbers, an image's file, a
-    text, a tensor's rows.
+    """Return the content of a `.rrd` file: entity -> tick (None for static data) -> numbers, an
+    image's file, a text, or a tensor's rows.
     """
     from rerun.chunk import RrdReader
 
@@ -110,7 +110,7 @@ def test_a_recording_of_rerun_holds_what_was_sent(tmp_path: Path) -> None:
 @pytest.mark.library("rerun")
 def test_a_live_viewer_of_rerun_has_to_run() -> None:
     with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))  # and does not listen
+        taken.bind(("127.0.0.1", 0))  # the socket does not listen
         with pytest.raises(
             ConfigError, match=r"no viewer listens at rerun\+http.*start it with `rerun`"
         ):
@@ -147,7 +147,7 @@ def listens(port: int) -> bool:
 
 @pytest.fixture
 def rerun_viewer() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """What receives recordings live, as Rerun's viewer does: its address, and its process."""
+    """Run a receiver of live recordings like Rerun's viewer; yield its address and its process."""
     port = free_port()
     with subprocess.Popen([sys.executable, "-c", _VIEWER, str(port)]) as process:
         try:

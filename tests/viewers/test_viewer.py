@@ -1,5 +1,5 @@
-"""A viewer never delays what it shows, whatever becomes of its disk, or of the other side; a run
-of the loop in it.
+"""A viewer never delays the control loop, whatever happens to its disk or to the receiver; and a
+run of the loop with a viewer.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Slow:
         self.closing_s = closing_s
         self.episodes: list[tuple[str, str]] = []
         self.written: list[int] = []
-        self.closed = 0  # episodes
+        self.closed = 0  # number of closed episodes
         if going:
             self.go.set()
 
@@ -58,7 +58,7 @@ def test_frames_beyond_the_queue_are_dropped_and_counted_and_none_waits() -> Non
         with viewer.episode("one"):
             viewer.add(ViewerFrame(0, 0.0))
             assert target.taken.wait(60)
-            # The writer stands still: had `add` waited, the test would hang.
+            # The writer is blocked. If `add` waited for it, the test would hang.
             for tick in range(1, 1000):
                 viewer.add(ViewerFrame(tick, 0.0))
             assert not viewer.has_room
@@ -142,7 +142,7 @@ HZ, ROWS, CHUNKS = 100.0, 4, 3
 
 
 class Counting(Agent):
-    """Chunks whose rows are numbered through."""
+    """A policy with chunks whose rows are numbered."""
 
     contract = Contract(action=ActionSpec(dim=2, delta=False), chunk=ROWS)
     asked = 0
@@ -155,7 +155,7 @@ class Counting(Agent):
 
 
 class Kept:
-    """A target that keeps its frames."""
+    """A target that stores its frames."""
 
     target, closing_s = "here", None
 

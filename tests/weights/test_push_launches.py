@@ -1,6 +1,6 @@
-"""The number of operations of a push on a GPU, which share the GPU and Python's lock with acts.
+"""The number of operations of a push on a GPU. They share the GPU and the GIL with acts.
 
-They are counted on the device "meta", for the shapes of π0: 3.5 billion parameters in 777 values.
+They are counted on the device "meta", with the shapes of π0: 3.5 billion parameters in 777 values.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def calls(counted: TorchCalls) -> tuple[int, int]:
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
 def test_a_push_of_pi0_from_the_same_gpu_takes_few_operations(dtype: torch.dtype) -> None:
-    """The learner's values have another type in the second case."""
+    """In the second case, the learner's values have another type."""
     current, pushed = values_of_pi0(), values_of_pi0(dtype)
     assert len(current) == 777
 
@@ -91,7 +91,7 @@ def test_a_push_of_pi0_from_the_same_gpu_takes_few_operations(dtype: torch.dtype
     # Memory for each value, and a few operations for all of them.
     assert operations[0] <= len(current) + 20
     assert operations[1] == 0
-    # Python waits for the flags of finite values and the sums of the digest alone.
+    # Python waits only for the flags of finite values and the sums of the digest.
     assert [calls(counted)[1] for counted in (checked, digested)] == [1, 2]
 
 

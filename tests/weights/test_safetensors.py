@@ -1,4 +1,4 @@
-"""Weights as bytes: what comes back, and headers that are rejected before anything is allocated."""
+"""Weights as bytes: decoded values, and headers that are rejected before any allocation."""
 
 from __future__ import annotations
 

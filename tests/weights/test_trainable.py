@@ -1,4 +1,4 @@
-"""The named values of numpy trees and torch modules, and pushed ones that do not fit."""
+"""The named values of numpy trees and torch modules, and pushed values that do not fit."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from vlagents_ray.weights.trainable import (
 
 
 class Linear(TrainableAgent):
-    """Acts by a tree of numpy arrays."""
+    """A policy that acts with a tree of numpy arrays."""
 
     trainable: ClassVar[str | None] = "tree"
 
@@ -131,7 +131,7 @@ class TestTorch:
                 return {"version": 1}
 
             def set_extra_state(self, state: Any) -> None:
-                """Nothing."""
+                """Do nothing."""
 
         assert set(named_values(WithState(2, 2))) == {"weight", "bias"}
 
@@ -218,7 +218,7 @@ def test_one_number_that_is_not_finite_is_found_among_many_tensors(
         "other": torch.zeros(5),
     }
     pushed = {name: one + 1 for name, one in held.items()}
-    pushed["3"][:] = torch.finfo(kind).max  # whose norms in other senses are infinite
+    pushed["3"][:] = torch.finfo(kind).max  # its norms of other orders are infinite
     assert set(trainable.accepted(held, pushed)) == set(held)
     pushed["2"][place] = value
     with pytest.raises(
@@ -229,7 +229,7 @@ def test_one_number_that_is_not_finite_is_found_among_many_tensors(
 
 
 def test_infinite_values_fit_where_the_policy_has_them() -> None:
-    mask = np.triu(np.full((2, 2), -np.inf, np.float32), 1)  # mask of causal attention
+    mask = np.triu(np.full((2, 2), -np.inf, np.float32), 1)  # a mask of causal attention
     assert (
         fitted(HELD | {"mask": mask}, NEW | {"mask": mask.copy()})["mask"].tolist() == mask.tolist()
     )
@@ -261,7 +261,8 @@ def test_what_changes_nothing_is_refused_unless_allowed() -> None:
     with pytest.raises(UnchangedWeights, match="got 3 equal ones"):
         fitted(HELD, same)
     assert fitted(HELD, same, allow_same=True)
-    assert fitted(HELD, same | {"n": np.int64(7)})  # one value of one name is enough
+    # one value suffices for values that share memory
+    assert fitted(HELD, same | {"n": np.int64(7)})
 
 
 def test_the_fingerprint_depends_on_names_shapes_types_and_values_alone() -> None:
@@ -295,7 +296,7 @@ LIBRARIES: dict[str, Callable[[np.ndarray], Any]] = {
 def of_library(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[np.ndarray], Any]:
-    """Makes the values of a policy of one library."""
+    """Return a function that makes the values of a policy of one library."""
     Gpu().install(monkeypatch)
     return LIBRARIES[request.param]
 

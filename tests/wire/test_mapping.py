@@ -1,5 +1,5 @@
-"""Another system's keys become an Obs, or an error that names their key; our action becomes
-theirs.
+"""Another system's keys become an `Obs`, or an error that names the key; this package's action
+becomes the other system's.
 """
 
 from __future__ import annotations
@@ -148,7 +148,8 @@ def test_a_grippers_command_is_turned_to_their_polarity() -> None:
     libero = presets()["openpi-libero"].rows(action, ours)
     assert libero[:, 6].tolist() == [-1, 1]
     assert action[:, 6].tolist() == [1, 0]
-    for openvla in ("openvla", "openvla-oft"):  # its clients turn it into LIBERO's themselves
+    # the clients of these presets convert the gripper for LIBERO themselves
+    for openvla in ("openvla", "openvla-oft"):
         assert presets()[openvla].rows(action, ours).tolist() == action.tolist()
         assert presets()[openvla].rows(
             libero, ActionSpec(7, gripper_open=-1.0, gripper_closed=1.0)

@@ -1,4 +1,6 @@
-"""A family's checkpoint is made whole or not at all, with a deployment file that serves it."""
+"""A family's checkpoint is created completely or not at all, with a deployment file that
+serves it.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ Known = Callable[..., list[Recipe]]
 
 @pytest.fixture
 def known(monkeypatch: pytest.MonkeyPatch) -> Known:
-    """Make a family `own` known, and return what it is asked for."""
+    """Register a family `own`, and return a growing list of the requests for it."""
 
     def add(*packages: str, fails: bool = False) -> list[Recipe]:
         asked: list[Recipe] = []

@@ -1,4 +1,4 @@
-"""Random weights are written in the format of safetensors, one tensor at a time."""
+"""Random weights are written in the safetensors format, one tensor at a time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vlagents_ray.errors import ConfigError
 
 pytestmark = pytest.mark.torch
 
-# Writes 256 MiB in 16 tensors, and prints by how many MiB the process grew meanwhile.
+# Writes 256 MiB in 16 tensors, and prints the growth of the process in MiB.
 _PEAK = """
 import resource, sys
 from pathlib import Path
@@ -46,8 +46,8 @@ def network() -> Any:
 
 
 def written(folder: Path) -> dict[str, Any]:
-    """The tensors of all files of a folder by name, each of which starts at a multiple of its
-    type's size.
+    """Return the tensors of all files of a folder by name; each starts at a multiple of its type's
+    size.
     """
     import torch
 
@@ -82,7 +82,7 @@ def test_every_tensor_of_a_model_is_written_in_its_type(tmp_path: Path) -> None:
         if name.endswith(("weight", "0.bias", "2.bias")):
             assert tensor.float().abs().sum() > 0, name
             assert tensor.flatten()[0] != tensor.flatten()[1], name
-    assert (tensors["1.running_var"] == 1).all()  # a buffer's own value
+    assert (tensors["1.running_var"] == 1).all()  # the buffer's own value
     assert tensors["1.num_batches_tracked"] == 0
     assert abs(float(tensors["1.weight"].float().mean()) - 1) < 0.1
 
