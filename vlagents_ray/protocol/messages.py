@@ -337,8 +337,8 @@ DecodedFiles = dict[int, tuple[np.ndarray, "bytes | memoryview"]]
 """Each image with the file from which it was decoded, by the `id` of the image."""
 # Size of the parsed Python objects per byte of JSON, within the limits of `frame_layout`.
 _JSON_FACTOR = 4
-# Limit of the time to decode a request's images, s per byte of `decoded_bytes`. It suffices for
-# PNG files that are slow to decode.
+# Limit of the time to decode a request's images, s per byte of `decoded_bytes`. The limit suffices
+# for PNG files that are slow to decode.
 _DECODING_S = 20e-9
 _LEAST_DECODING_S = 10e-3
 

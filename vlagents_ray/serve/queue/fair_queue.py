@@ -138,7 +138,7 @@ class FairQueue:
         self._queues_by_priority = [_SourceQueue() for _ in Priority]
         self._patient = _PatientQueue()
         self._sessions: dict[str, _SessionQueue] = {}
-        # The only waiting request, which is not in a session's queue.
+        # The waiting request if there is only one; it is not in a session's queue.
         self._lone: PendingRequest | None = None
         self._yielded = False  # whether the last batch had a slot for an impatient simulation
         # Number of waiting requests by priority, including requests that are over.

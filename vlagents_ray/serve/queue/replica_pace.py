@@ -398,8 +398,8 @@ class ReplicaPace:
         robots = sum(needs.values())
         if not robots:
             return IDLE
-        # A robot that cannot be in time even alone does not count, since the load would be `inf`
-        # because of it.
+        # A robot that cannot be in time even alone does not count, since it would make the load
+        # `inf`.
         soonest_s = answer_s(curve, 1, robots)
         servable = {need: count for need, count in needs.items() if need.interval_s(soonest_s) > 0}
         return replica_load(curve, servable, self._max_batch_size)

@@ -117,7 +117,9 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._code, self._program = settings.code()
         self._keys = settings.access.keys()
         require_access(http_options().host or EVERYWHERE, self._keys, settings.access.insecure)
-        write_audit()  # also without keys, since it logs the buttons pressed on the live page
+        # The audit log is also needed without keys: it contains the buttons pressed on the live
+        # page.
+        write_audit()
         if self._keys is not None and not settings.access.plain_http:
             warn_of_plain_http(_plain_host())
         self._tasks: list[asyncio.Task[None]] = []
