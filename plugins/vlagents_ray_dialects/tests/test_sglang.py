@@ -236,7 +236,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: asking(
             observation={"images": {"front": {"values": [1, 2], "shape": [3], "dtype": "uint8"}}}
         ),
-        "expected an array of",
+        "no array of",
     ),
     "noise": (lambda: asking(observation=observed(noise=np.zeros(3))), "the policy draws its own"),
     "unequal lengths": (
