@@ -103,7 +103,7 @@ def test_errors_of_the_policy_in_a_row_stop_the_evaluation(
     done = eval_of(tmp_path / "out", agent, monkeypatch, episodes=50, abort_after=3)
     assert done.exit_code == run.POLICY_ERRORS, done.output
     assert (
-        "3 episodes in a row ended by an error of the policy: policy_failed: policy act: KeyError"
+        "3 episodes in a row ended with an error of the policy: policy_failed: policy act: KeyError"
         in done.stderr
     )
     assert "3/50" in done.stdout

@@ -197,7 +197,7 @@ def test_a_replay_that_infrastructure_kept_from_ending_is_no_difference(
             EpisodeResult(recorded.episode.result.key, "infra_failed", error="it hung"), attempts=4
         )
     with pytest.raises(
-        ConfigError, match=r"expected a finished replay to compare, got one that failed: it hung"
+        ConfigError, match=r"expected a finished replay to compare, got a failed replay: it hung"
     ):
         compare(recorded, Results.load(settings.out))
 

@@ -1,4 +1,5 @@
-"""Evaluations: episodes run in parallel in Ray actors, and each is recorded exactly once.
+"""Evaluations: episodes run in parallel in Ray actors, and each episode is recorded exactly
+once.
 
     policies = [{"url": "http://localhost:8000"}]
     suites = [{"envs": ["tabletop"]}]
@@ -51,7 +52,7 @@ _LATE = {
     "report.terminal": ("Progress", "print_summary", "progress_for", "results_table"),
     "run": ("EvaluationInterrupted", "OutOfTime", "check", "evaluate"),
     "workers.cluster": ("most_cpus", "most_gpus"),
-}  # module: its names
+}  # module -> names that are imported from it on first use
 
 __all__ = [
     "ClockConfig",

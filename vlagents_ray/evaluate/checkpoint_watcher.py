@@ -1,4 +1,4 @@
-"""Finds the new checkpoints of a running training when they are complete."""
+"""Detects when new checkpoints of a running training are complete."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from vlagents_ray.policies.base.checkpoint_files import unfinished
 
 FINISHED = "training_finished"  # name of the file that announces the end of the training
 
-# The path, the size in bytes and the modification time in ns of each file.
+# Path, size in bytes and modification time in ns of each file.
 Snapshot = frozenset[tuple[str, int, int]]
 
 
 @dataclass(slots=True)
 class _IncompleteCheckpoint:
-    """The state of an incomplete checkpoint since its last change."""
+    """An incomplete checkpoint since its last change."""
 
     snapshot: Snapshot
-    since: float  # when this snapshot was first taken, s
-    why: str = ""  # the reason why it is not complete
-    examined: bool = False  # whether its files were examined since they changed
+    since: float  # time at which this snapshot was first taken, s
+    why: str = ""  # the reason why the checkpoint is incomplete
+    examined: bool = False  # whether the files were checked since their last change
 
 
 class CheckpointWatcher:
@@ -44,13 +44,13 @@ class CheckpointWatcher:
         """Watch for checkpoints.
 
         A checkpoint is complete when `vlagents_ray.policies.base.checkpoint_files` finds no fault
-        in it, and either its names, sizes and times have not changed for `settle_s` seconds, or it
-        contains a file called `marker`.
+        in it, and either the names, sizes and times of its files have not changed for `settle_s`
+        seconds, or it contains a file named `marker`.
 
         Args:
             pattern: A checkpoint's path with `{step}` in it.
             folder: The folder of the steps; by default the part of `pattern` before `{step}`.
-            settle_s: Seconds without a change.
+            settle_s: The required time without a change, s.
             marker: The name of the file that the trainer writes last, if there is one.
         """
         names = PurePath(pattern).parts
@@ -71,10 +71,11 @@ class CheckpointWatcher:
         self._complete: set[int] = set()
 
     def scan(self, now: float) -> list[int]:
-        """Return the steps that were completed since the last call, ascending.
+        """Return the steps of the checkpoints that were completed since the last call, in ascending
+        order.
 
         Args:
-            now: The time, s, of any clock.
+            now: The time of any monotonic clock, s.
         """
         paths_by_step = self._paths_by_step()
         for step in self._incomplete.keys() - paths_by_step.keys():
@@ -93,7 +94,7 @@ class CheckpointWatcher:
 
     @property
     def finished(self) -> bool:
-        """Whether the training has announced that no checkpoint follows."""
+        """Whether the training has announced that it writes no further checkpoint."""
         return (self.folder / FINISHED).exists()
 
     def is_settled(self, now: float) -> bool:
@@ -102,21 +103,22 @@ class CheckpointWatcher:
         return all(now - checkpoint.since >= self._settle_s for checkpoint in checkpoints)
 
     def waiting(self) -> dict[int, str]:
-        """Return the steps that are not complete, each with the reason."""
+        """Return the steps of the incomplete checkpoints, each with the reason."""
         return {step: checkpoint.why for step, checkpoint in sorted(self._incomplete.items())}
 
     def _paths_by_step(self) -> dict[int, tuple[Path, Path]]:
-        """Return, by step, the entry of the folder and the path that the policy loads, which is the
-        entry or a path in it.
+        """Return two paths for each step: the entry of the folder, and the path that the policy
+        loads, which is the entry or is below it.
         """
         paths: dict[int, tuple[Path, Path]] = {}
         for entry in self.folder.iterdir() if self.folder.is_dir() else ():
             match = self._name.fullmatch(entry.name)
             step = int(match[1]) if match else -1
-            # `find_checkpoint` accepts these two forms of the step.
+            # `find_checkpoint` accepts only these two forms of a step.
             if match is None or match[1] not in (str(step), f"{step:06d}"):
                 continue
-            if step not in paths or match[1] == str(step):  # the policy looks for this name first
+            # The policy searches for this name first.
+            if step not in paths or match[1] == str(step):
                 names_below = [at_step(name, match[1]) for name in self._below]
                 paths[step] = (entry, entry.joinpath(*names_below))
         return paths
@@ -139,7 +141,7 @@ class CheckpointWatcher:
 
         state.why = unfinished(checkpoint) or ""
         state.examined = True
-        # The files have no fault, but they may have changed while they were examined.
+        # The files have no fault, but they may have changed during the check.
         return not state.why and _snapshot(entry) == snapshot
 
 
@@ -149,17 +151,17 @@ def rounds(
     pause: Callable[[], object],
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[list[int]]:
-    """Yield the completed steps up to `until`, until a step at or after `until` is complete or the
-    training has announced its end.
+    """Yield the completed steps up to `until`. End when a step at or after `until` is complete, or
+    when the training has announced its end.
 
     Args:
-        watcher: Finds the checkpoints.
+        watcher: Detects the checkpoints.
         until: The last step to evaluate; None for all steps.
         pause: Called between two scans of the folder.
         clock: Returns the time, s.
     """
     while True:
-        # The announcement is read before the scan, which then finds all checkpoints.
+        # Read the announcement before the scan, so that the scan finds all checkpoints.
         now, finished = clock(), watcher.finished
         steps = watcher.scan(now)
         steps_to_evaluate = [step for step in steps if until is None or step <= until]
@@ -184,7 +186,7 @@ def _snapshot(entry: Path) -> Snapshot:
 
     files = set()
     for path in paths:
-        with contextlib.suppress(FileNotFoundError):  # it has been renamed
+        with contextlib.suppress(FileNotFoundError):  # the file was renamed meanwhile
             state = path.stat()
             files.add((str(path), state.st_size, state.st_mtime_ns))
     return frozenset(files)

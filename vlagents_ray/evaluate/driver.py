@@ -1,5 +1,6 @@
-"""The driver of evaluations and of rollouts: it hands the jobs of a plan to workers, repeats
-attempts that infrastructure failed, and ends when too many episodes in a row are lost.
+"""The driver of evaluations and of rollouts: it assigns the jobs of a plan to workers, repeats
+attempts that failed because of infrastructure, and ends the run when too many episodes in a row are
+lost.
 """
 
 from __future__ import annotations
@@ -18,19 +19,22 @@ from vlagents_ray.evaluate.workers.rollout import Report
 
 
 class Consumer(ABC):
-    """Receives the episodes of a driver: to write results, or to return them to a learner."""
+    """Receives the results of a driver's episodes, e.g. to write them to disk or to return them to
+    a learner.
+    """
 
-    # The cures in the errors that end a run, after many errors of the policy or many losses.
+    # The cures in the errors that end a run: after many policy errors in a row, and after many lost
+    # episodes in a row.
     policy_cure: str
     loss_cure: str
 
     @abstractmethod
     def began(self, jobs: tuple[Job, ...]) -> None:
-        """Note that a worker begins these jobs."""
+        """Called when a worker begins these jobs."""
 
     @abstractmethod
     def described(self, job: Job, report: Report) -> None:
-        """Note the policy, the environment and the worker, if a report describes new ones."""
+        """Called with each report, which may describe a new policy, environment or worker."""
 
     def is_needed(self, job: Job) -> bool:
         """Return whether a failed attempt at this episode may be repeated."""
@@ -38,20 +42,22 @@ class Consumer(ABC):
 
     @abstractmethod
     def attempt_failed(self, job: Job, failure: Failure, *, repeated: bool) -> None:
-        """Note that infrastructure failed an attempt; `repeated` is whether another follows."""
+        """Called when an attempt has failed because of infrastructure; `repeated`: whether another
+        attempt follows.
+        """
 
     @abstractmethod
     def finished(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
-        """Take the result of an episode, which does not run again. Its status is "infra_failed"
-        if it was lost.
+        """Called with the final result of an episode. The status of a lost episode is
+        "infra_failed".
         """
 
 
 class Driver:
-    """Hands the unfinished jobs of a plan to workers, and handles the report about each.
+    """Assigns the unfinished jobs of a plan to workers, and handles their reports.
 
-    It has no thread and no loop: its owner calls `hand_out`, waits for reports of the workers, and
-    passes each to `take`.
+    The driver has no thread and no loop: its owner calls `hand_out`, waits for the workers'
+    reports, and passes each report to `take`.
     """
 
     def __init__(self, plan: ResolvedPlan, jobs: Iterable[Job], consumer: Consumer) -> None:
@@ -59,20 +65,20 @@ class Driver:
 
         Args:
             plan: The plan of the jobs.
-            jobs: The jobs, in the order in which they begin in each environment.
+            jobs: The jobs; within each environment, they begin in this order.
             consumer: Receives the results.
         """
         self.queue = JobQueue(jobs)
         self._retries = plan.retries
         self._abort_after = plan.abort_after
         self._consumer = consumer
-        self._lost = 0  # episodes in a row
-        self._policy_errors = 0  # episodes in a row
-        # The number of steps, and the digest of the actions, of episodes whose simulation diverged.
+        self._lost = 0  # number of consecutive lost episodes
+        self._policy_errors = 0  # number of consecutive episodes with a policy error
+        # Number of steps and digest of the actions of each episode whose simulation diverged.
         self._diverged: dict[EpisodeKey, tuple[int, str | None]] = {}
 
     def hand_out(self, pool: Workers) -> None:
-        """Hand waiting jobs to idle workers, and start workers while more are needed."""
+        """Assign waiting jobs to idle workers, and start more workers if they are needed."""
         for worker in pool.idle():
             jobs = self.queue.take(worker.kind, worker.env_place, pool.busy_places())
             if jobs:
@@ -86,12 +92,12 @@ class Driver:
             pool.start(case)
 
     def take(self, job: Job, report: Report) -> None:
-        """Pass a result to the consumer, or repeat the job.
+        """Pass the result in a report to the consumer, or repeat the job.
 
         Raises:
-            PolicyFailed: Too many episodes in a row ended by an error of the policy.
-            VLAgentsError: A failure that the user can correct; or the last one, if too many
-                episodes in a row were lost.
+            PolicyFailed: Too many episodes in a row ended with an error of the policy.
+            VLAgentsError: The error of a failure that the user can correct; or the last error, if
+                too many episodes in a row were lost.
         """
         self._consumer.described(job, report)
         if report.failure is not None:
@@ -102,7 +108,8 @@ class Driver:
     def _failed(self, job: Job, failure: Failure) -> None:
         """Repeat a failed attempt, or finish its episode as lost."""
         if failure.diverged is not None and self._diverged_before(job, failure.diverged):
-            # Under the same actions: the policy is the cause, and has failed.
+            # The simulation diverged again under the same actions, so the policy is the cause, and
+            # has failed.
             self._finish(job, failure.diverged, Artifacts())
             return
 
@@ -120,12 +127,12 @@ class Driver:
             self._count_loss(failure)
 
     def _must_be_alone(self, job: Job, failure: Failure) -> bool:
-        """Return whether the next attempt runs without other episodes in its simulator, as
+        """Return whether the next attempt must run without other episodes in its simulator, since
         one of them may be the cause of the failure.
 
         After a simulator broke, all its episodes are first repeated together, since most simulators
-        do not break again. The last attempt is always alone, so that an episode which breaks its
-        simulator does not lose others.
+        do not break again. The last attempt is always alone, so that no other episode is lost if
+        this episode breaks the simulator.
         """
         broke_again = failure.cause == "worker" and job.attempt >= min(2, self._retries)
         return failure.names_no_episode or broke_again
@@ -151,7 +158,7 @@ class Driver:
         self._policy_errors += 1
         if self._policy_errors == self._abort_after:
             raise PolicyFailed(
-                f"{self._policy_errors} episodes in a row ended by an error of the policy: "
+                f"{self._policy_errors} episodes in a row ended with an error of the policy: "
                 f"{error.strip()}; {self._consumer.policy_cure}"
             )
 

@@ -22,7 +22,7 @@ Type = Literal["string", "integer", "number", "boolean", "time", "json"]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column. Any value may be empty, for example if infrastructure made the episode fail."""
+    """A column. Any value may be empty, for example if infrastructure failed."""
 
     name: str
     type: Type
@@ -202,7 +202,7 @@ def rows(results: Results, *, flat: bool = False) -> Iterator[dict[str, Any]]:
 
 
 def to_json(results: Results, path: Path) -> int:
-    """Write a list with one object for each episode; times are ISO 8601, in UTC.
+    """Write a list with one object for each episode; times are in ISO 8601 and UTC.
 
     Returns:
         The number of episodes.
@@ -216,8 +216,8 @@ def to_json(results: Results, path: Path) -> int:
 
 
 def to_csv(results: Results, path: Path) -> int:
-    """Write a header, and a line for each episode. None is an empty field, and a boolean is `true`
-    or `false`.
+    """Write a header, and a line for each episode. None is written as an empty field, and a boolean
+    as `true` or `false`.
 
     Returns:
         The number of episodes.

@@ -15,10 +15,10 @@ from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results
 
-_FEW = 5  # most names in a message
+_FEW = 5  # maximum number of names in a message
 # The largest differences that count as rounding: absolute for numbers up to 1, relative for larger
-# ones. At the first step that differs, a batch of another size changes 1e-7 to 1e-5. Later steps
-# amplify that, since each observation depends on the actions before it.
+# numbers. At the first step that differs, another batch size causes differences of 1e-7 to 1e-5.
+# Later steps amplify these differences, since each observation depends on the actions before it.
 ROUNDING = 1e-4
 DRIFT = 1e-2
 
@@ -26,18 +26,16 @@ DRIFT = 1e-2
 @dataclass(frozen=True, slots=True)
 class ActionsDifference:
     """The differences between the actions of two episodes of the same length. They are absolute for
-    numbers up to 1, and relative for larger ones.
+    numbers up to 1, and relative for larger numbers.
     """
 
-    step: int  # the first step that differs; the observations until then were the same
+    step: int  # the first step that differs; the observations up to it were equal
     at_first: float  # the largest difference at that step
     largest: float  # the largest difference at any step
 
     @property
     def is_rounding(self) -> bool:
-        """Whether different rounding explains the difference, at the first step and at later
-        ones.
-        """
+        """Whether rounding explains the difference, at the first step and at later steps."""
         return self.at_first <= ROUNDING and self.largest <= DRIFT
 
 
@@ -55,27 +53,27 @@ class Recorded:
         return self.episode.result.key.episode, self.episode.result.key.seed
 
     def config(self, out: Path, *, policy: dict[str, Any] | None = None) -> EvalConfig:
-        """Return the settings of an evaluation of only this episode's case, with video and
-        trajectory. All other settings are the settings of the episode's run.
+        """Return the settings for an evaluation of only this episode's case, with video and
+        trajectory. All other settings are those of the episode's run.
 
         Args:
             out: The folder of results.
             policy: Replaces settings of the policy.
 
         Raises:
-            ConfigError: The settings of the run have no such case.
+            ConfigError: The settings of the run do not contain the case.
         """
         run = next(run for run in self.results.runs if run.run == self.episode.run)
         config = EvalConfig.model_validate(run.config)
-        # The case is found by its settings, as `merge` may have taken the suite's name from another
-        # folder.
+        # Search the case by its settings, since `merge` may have taken the suite's name from
+        # another folder.
         cases = plan_cases(config)
         case = next((case for case in cases if case.fingerprint == self.case.case_id), None)
         if case is None:
             raise ConfigError(
                 f"{self.results.out}: expected the case of {self.episode.result.key} in the "
-                f"settings of run {run.run}, got others; replay it in the folder in which it was "
-                "run"
+                f"settings of run {run.run}, got other cases; replay the episode in the folder in "
+                f"which it was run"
             )
 
         policy_settings = case.policy.model_dump()
@@ -83,7 +81,8 @@ class Recorded:
         if case.policy.source is None:
             policy_settings["config"] = {}  # the server has its own configuration
         else:
-            policy_settings["url"] = None  # it was served for that run, and will be served again
+            # The policy was served for that run, and will be served again.
+            policy_settings["url"] = None
         if policy is not None:
             policy_settings.pop("name", None)
             policy_settings |= policy
@@ -102,8 +101,8 @@ class Recorded:
 
 
 def find(results: Results, name: str | None) -> Recorded:
-    """Find the episode with the key `name`, or "ENV#N" for the only one with the number N in an
-    env.
+    """Find the episode with the key `name`; `name` may also be "ENV#N" if only one episode in the
+    env has the number N.
 
     Raises:
         ConfigError: `name` is None, or no episode or several episodes have this name, or the
@@ -144,12 +143,12 @@ def find(results: Results, name: str | None) -> Recorded:
 
 
 def compare(recorded: Recorded, replayed: Results) -> list[str]:
-    """Return a sentence for each difference of the replay; empty if it is the same episode up to
-    rounding.
+    """Return a sentence for each difference between replay and recording; empty if the episodes are
+    equal up to rounding.
 
-    Actions that differ in their bytes count as the same if the difference `is_rounding` (see
-    `actions_difference`). In that case, returns that differ by at most `DRIFT` also count as the
-    same. Durations are not compared.
+    Actions with different bytes count as equal if the difference `is_rounding` (see
+    `actions_difference`). Then returns also count as equal if they differ by at most `DRIFT`.
+    Durations are not compared.
 
     Raises:
         ConfigError: The replay failed because of infrastructure.
@@ -157,7 +156,7 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
     [[replay]] = [case.episodes for case in replayed.cases]
     if replay.result.status == "infra_failed":
         raise ConfigError(
-            f"expected a finished replay to compare, got one that failed: {replay.result.error}"
+            f"expected a finished replay to compare, got a failed replay: {replay.result.error}"
         )
 
     recorded_outcome = recorded.episode.result.outcome
@@ -218,7 +217,9 @@ def actions_difference(recorded: Recorded, replayed: Results) -> ActionsDifferen
 
 
 def _trajectory_file(results: Results, episode: Episode) -> Path | None:
-    """Return the file of an episode's trajectory; None if it was not recorded or is missing."""
+    """Return the file of an episode's trajectory; None if the trajectory was not recorded or is
+    missing.
+    """
     if episode.trajectory is None:
         return None
     file = results.file(episode.trajectory)
@@ -226,14 +227,15 @@ def _trajectory_file(results: Results, episode: Episode) -> Path | None:
 
 
 def _describe_actions(recorded: Recorded, replayed: Path) -> str:
-    """Return a sentence about the actions, from the recorded and the replayed trajectory."""
+    """Return a sentence about the difference between the actions of the recorded and the replayed
+    trajectory.
+    """
     path = recorded.episode.trajectory
     if path is None:
         return (
             "actions: they differ, but without a recorded trajectory (eval --record all, or "
             "`record: all` in its file) neither the first step nor the size of the difference is "
-            "known; the size of a batch, which several episodes share, changes the last digits "
-            "of an action, about 1e-7"
+            "known; another batch size changes the last digits of an action, by about 1e-7"
         )
 
     file = recorded.results.file(path)

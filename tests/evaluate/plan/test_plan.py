@@ -247,7 +247,7 @@ def test_numbers_that_json_lacks_are_refused(value: Any) -> None:
 
 def test_a_batch_has_no_latency_to_measure() -> None:
     assert SuiteConfig(envs=["line"], num_envs=2, clock=ClockConfig(latency=0.1)).clock is not None
-    with pytest.raises(ValidationError, match="of the whole batch, got"):
+    with pytest.raises(ValidationError, match="as a batch has only one latency, got"):
         SuiteConfig(envs=["line"], num_envs=2, clock=ClockConfig())
 
 
@@ -255,14 +255,14 @@ def test_a_batch_has_no_latency_to_measure() -> None:
     ("wrong", "said"),
     [
         ({"wokers": 3}, "wokers"),
-        ({"envs": ["a", "b", "a"]}, "named twice"),
+        ({"envs": ["a", "b", "a"]}, "expected each env once, got .*'a'.* twice"),
         (
             {"policies": [{"name": "a", "url": "http://x"}, {"name": "a", "url": "http://y"}]},
             "policies: expected different names",
         ),
         (
             {"policy_options": {"seed": 3, "checkpoint_step": 20}},
-            r"expected none that the evaluation sets for each episode, got \['seed'\]",
+            r"expected no options that the evaluation sets for each episode, got \['seed'\]",
         ),
     ],
 )

@@ -1,1 +1,1 @@
-"""The files of episodes: videos, trajectories, provenance."""
+"""The files of episodes: videos, trajectories and provenance."""

@@ -1,10 +1,10 @@
 """The artifacts of an episode: videos for people and a trajectory for programs.
 
-A trajectory has the numbers of every step in a .npz file, and the policy's images in MP4 files next
-to it. The worker encodes each frame immediately, as H.264, which browsers can decode. A frame of
-224x224 takes about 0.3 ms, less than a JPEG, so there is no thread and no backlog. Files are made
-in memory and sent to the driver with the episode's result. This works on any node, and a worker
-that dies leaves no partial files.
+A trajectory consists of a .npz file with the numbers of every step, and of MP4 files with the
+policy's images. The worker encodes each frame immediately, as H.264, which browsers can decode.
+Encoding a frame of 224x224 takes about 0.3 ms, less than a JPEG, so no thread is needed and no
+backlog arises. Files are created in memory and sent to the driver with the episode's result. This
+works on any node, and a worker that dies leaves no partial files.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ class VideoRecorder(EpisodeObserver):
     """Videos of one episode, one for each camera. `close` frees the encoders."""
 
     def __init__(self, fps: float | None = None, *, lossless: bool = False) -> None:
-        """Begin without images.
+        """Create a recorder without images.
 
         Args:
             fps: The frames per second; None: `DEFAULT_FPS`.
-            lossless: Whether to keep each pixel, which browsers cannot decode.
+            lossless: Whether to encode without loss, in a format that browsers cannot decode.
         """
         self._fps = fps or DEFAULT_FPS
         self._lossless = lossless
-        self._tracks: dict[str, tuple[io.BytesIO, Mp4]] = {}  # by camera
+        self._tracks: dict[str, tuple[io.BytesIO, Mp4]] = {}  # the encoder of each camera
 
     def add_observation(self, obs: Obs) -> None:
         """Append every camera's image, (H, W, 3) uint8 RGB."""
@@ -58,7 +58,7 @@ class VideoRecorder(EpisodeObserver):
                 raise EnvFailed(f"camera {name!r}: {error}") from error
 
     def finish(self) -> dict[str, bytes]:
-        """Finish the videos, by camera; the recorder is empty afterwards."""
+        """Finish and return the videos by camera; the recorder is empty afterwards."""
         videos: dict[str, bytes] = {}
         while self._tracks:
             name, (file, track) = self._tracks.popitem()
@@ -67,7 +67,7 @@ class VideoRecorder(EpisodeObserver):
         return dict(sorted(videos.items()))
 
     def close(self) -> None:
-        """Drop the videos that are not finished."""
+        """Discard the unfinished videos."""
         while self._tracks:
             _, (_, track) = self._tracks.popitem()
             track.abandon()
@@ -79,8 +79,8 @@ def save_videos(
     """Write `out/videos/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME_CAMERA.mp4` for each camera.
 
     A suite without a name has no folder. Two cameras never share a file
-    (`vlagents_ray.naming.distinct`). A file gets its name when it is complete. Files of an earlier
-    attempt at the episode are removed.
+    (`vlagents_ray.naming.distinct`). A file is renamed to its final name when it is complete. Files
+    of an earlier attempt at the episode are removed.
 
     Returns:
         The paths relative to `out`.
@@ -98,8 +98,8 @@ def save_videos(
 
 
 def _folder_for(out: Path, category: str, case: EvalCase, result: EpisodeResult) -> Path:
-    """Return the folder `out/CATEGORY/POLICY/SUITE/ENV`, after removing the files of an earlier
-    attempt at the episode from it.
+    """Return the folder `out/CATEGORY/POLICY/SUITE/ENV`, after removing the episode's files of an
+    earlier attempt.
     """
     subfolders = [plain(name) for name in case.name if name]
     folder = out.joinpath(category, *subfolders)
@@ -109,23 +109,25 @@ def _folder_for(out: Path, category: str, case: EvalCase, result: EpisodeResult)
 
 
 def _stem(result: EpisodeResult) -> str:
-    """Return the beginning of the names of an episode's files, before "_" or "."."""
+    """Return the common beginning of the names of an episode's files, before "_" or "."."""
     return f"ep{result.key.episode:04d}_seed{result.key.seed}"
 
 
-# The version if a policy reports none, and for steps before its first answer in real-time mode.
+# The version for a policy that reports none, and for steps before the first answer in real-time
+# mode.
 NO_VERSION = -1
-_STATE = "state/"  # prefix of the state's arrays in the .npz file
+_STATE = "state/"  # prefix of the names of the state's arrays in the .npz file
 
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """T actions of D numbers each, and T + 1 observations: action i was chosen after observation i.
+    """A trajectory: T actions of D numbers each, and T + 1 observations; action i was chosen after
+    observation i.
 
     The images are in MP4 files next to the .npz file; frame i belongs to observation i.
     """
 
-    actions: np.ndarray  # (T, D) float32, as executed
+    actions: np.ndarray  # (T, D) float32, the executed actions
     rewards: np.ndarray  # (T,) float64
     success: np.ndarray  # (T,) bool: whether the task was solved in the state after the action
     state: dict[str, np.ndarray]  # (T + 1, D) float32, in the contract's units
@@ -156,7 +158,7 @@ class Trajectory:
         """
         storage.require_there(path)
         try:
-            # The file is opened here, since np.load leaves the file of a broken archive open.
+            # Open the file here, since np.load does not close the file of a broken archive.
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 state = {}
                 for name in file.files:
@@ -183,13 +185,13 @@ class TrajectoryRecorder(EpisodeObserver):
     """Collects the numbers of one episode."""
 
     def __init__(self) -> None:
-        self._states: list[dict[str, np.ndarray]] = []  # states of each observation
-        self._grippers: list[float | None] = []  # grippers of each observation
-        # The action, reward, success and version of each step.
+        self._states: list[dict[str, np.ndarray]] = []  # state of each observation
+        self._grippers: list[float | None] = []  # gripper of each observation
+        # Action, reward, success and version of each step.
         self._steps: list[tuple[np.ndarray, float, bool, int]] = []
         self._cameras: tuple[str, ...] = ()
         self._version = NO_VERSION
-        # The number of steps until the next version, and that version.
+        # The next version, and the number of steps until it applies.
         self._next: tuple[int, int] = (0, NO_VERSION)
 
     def add_observation(self, obs: Obs) -> None:
@@ -197,7 +199,7 @@ class TrajectoryRecorder(EpisodeObserver):
 
         Raises:
             EnvFailed: The state has other parts or shapes than in the first observation, or only
-                one of the two has a gripper.
+                one of these two observations has a gripper.
         """
         state = {name: np.array(values, np.float32) for name, values in obs.state.items()}
         if self._states and _shapes(state) != _shapes(self._states[0]):
@@ -212,13 +214,13 @@ class TrajectoryRecorder(EpisodeObserver):
                 "both"
             )
 
-        # A later observation may lack the cameras of the reset.
+        # Keep the cameras of the reset, since a later observation may lack them.
         self._cameras = self._cameras or tuple(sorted(obs.cameras))
         self._states.append(state)
         self._grippers.append(obs.gripper)
 
     def add_act(self, act: Act, ticks_waited: int = 0) -> None:
-        """Record the version of this answer, which applies after `ticks_waited` further
+        """Record the version of weights in an answer; it applies after `ticks_waited` further
         actions.
         """
         version = version_of(act)
@@ -273,7 +275,7 @@ def _shapes(state: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
 
 @dataclass(frozen=True, slots=True)
 class Artifacts:
-    """The recorded files of an episode, as the worker sends them to the driver with its result.
+    """The recorded files of an episode, which the worker sends to the driver with the result.
 
     An MP4 file has a frame for every observation.
     """
@@ -281,17 +283,17 @@ class Artifacts:
     videos: dict[str, bytes] = field(default_factory=dict)  # MP4 files for people, by camera
     # MP4 files of the policy's images, by camera
     policy_videos: dict[str, bytes] = field(default_factory=dict)
-    trajectory: bytes | None = None  # a `Trajectory` as .npz
+    trajectory: bytes | None = None  # a `Trajectory` as an .npz file
     transitions: Any = None  # a pyarrow.RecordBatch, for a learner
-    not_repeatable: str | None = None  # reason why the second pass did not render images
+    not_repeatable: str | None = None  # reason why the second pass rendered no images
 
 
 class EpisodeRecorder(EpisodeObserver):
-    """The interface of objects that record one episode. This class records nothing."""
+    """The interface of a recorder for one episode. This class itself records nothing."""
 
     @property
     def wants_images(self) -> EpisodeChoice:
-        """The episodes that need the images of every step."""
+        """The choice of episodes for which the recorder needs the images of every step."""
         return "none"
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
@@ -307,11 +309,11 @@ class EpisodeRecorder(EpisodeObserver):
         """Free the recorder's resources."""
 
 
-RecorderFactory = Callable[[float | None], EpisodeRecorder]  # called with the env's control_hz
+RecorderFactory = Callable[[float | None], EpisodeRecorder]  # the argument is the env's control_hz
 
 
 class Recording(EpisodeRecorder):
-    """Records a video and a trajectory of one episode, if it is among the chosen ones."""
+    """Records a video and a trajectory of one episode, if the settings choose the episode."""
 
     def __init__(
         self,
@@ -324,16 +326,17 @@ class Recording(EpisodeRecorder):
         """Begin to record.
 
         Args:
-            video: The episodes of which there are videos.
-            trajectory: The episodes of which there are trajectories.
+            video: The choice of episodes with a video.
+            trajectory: The choice of episodes with a trajectory.
             fps: The frames per second of the videos; None: `DEFAULT_FPS`.
-            images: The images of trajectories: "small", the same videos; "exact", each pixel.
+            images: The images of trajectories: "small" uses the lossy videos, "exact" preserves
+                each pixel.
         """
         self._wants_video = video
         self._wants_trajectory = trajectory
         self._video = VideoRecorder(fps)
         self._policy_video = self._video
-        self._recorded_videos = [self._video]  # those that are needed
+        self._recorded_videos = [self._video]  # the video recorders in use
         if images == "exact" and trajectory != "none":
             self._policy_video = VideoRecorder(fps, lossless=True)
             self._recorded_videos = [self._policy_video]
@@ -352,7 +355,9 @@ class Recording(EpisodeRecorder):
 
     @property
     def wants_images(self) -> EpisodeChoice:
-        """The episodes that need the images of every step, for a video or a trajectory."""
+        """The choice of episodes for which the images of every step are needed, for a video or a
+        trajectory.
+        """
         choices = (self._wants_video, self._wants_trajectory)
         if "all" in choices:
             return "all"
@@ -371,7 +376,9 @@ class Recording(EpisodeRecorder):
             observer.add_action(action, reward, success)
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
-        """Return the video and the trajectory of the episode, if the settings choose it."""
+        """Return the video and the trajectory of the episode, if the settings choose the
+        episode.
+        """
         wants_video = _is_chosen(self._wants_video, result)
         wants_trajectory = _is_chosen(self._wants_trajectory, result)
         if not wants_video and not wants_trajectory:
@@ -407,8 +414,8 @@ def save(
     """Write the files of an episode below `out`.
 
     A trajectory consists of `out/trajectories/POLICY/SUITE/ENV/epNNNN_seedS.npz` and its
-    `_CAMERA.mp4` files, which are links to the videos for people if these are the same. The .npz
-    file is written last: if it exists, the other files do too.
+    `_CAMERA.mp4` files. These are links to the videos for people if both are equal. The .npz file
+    is written last: if it exists, all other files exist as well.
 
     Returns:
         The paths of the videos and of the trajectory, relative to `out`.

@@ -1,4 +1,4 @@
-"""The files of an episode: their paths, atomic writing, and errors of the disk."""
+"""The files of an episode: paths, atomic writing, and errors of the disk."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _CURES = {
     ),
     errno.ESTALE: ("the file server has lost the folder", f"mount it again; {_RESUME}"),
 }
-# SQLite reports these texts in place of the system's errno.
+# SQLite reports these texts instead of the system's errno.
 _SQLITE = {
     "database or disk is full": errno.ENOSPC,
     "attempt to write a readonly database": errno.EROFS,
@@ -51,7 +51,8 @@ _SQLITE = {
 
 
 def require_below(path: str) -> str:
-    """Return the `path` of an episode's file in results.db, which may come from another machine.
+    """Check the `path` of an episode's file in a results.db, which may come from another machine,
+    and return it.
 
     Raises:
         ConfigError: The path leads out of the folder of results.
@@ -66,8 +67,8 @@ def require_below(path: str) -> str:
 
 
 def inside(home: Path, path: str) -> Path:
-    """Return the absolute path of the file `path` in the folder of results `home`; it need not
-    exist.
+    """Return the absolute path of the file `path` in the folder of results `home`; the file need
+    not exist.
 
     Raises:
         ConfigError: The path leads out of the folder, directly or through a symbolic link.
@@ -82,22 +83,24 @@ def inside(home: Path, path: str) -> Path:
 
 
 def trajectory_videos(home: Path, trajectory: str) -> list[str]:
-    """Return the MP4s of a trajectory's images, relative to the folder of results `home`."""
+    """Return the paths of the MP4 files with a trajectory's images, relative to the folder of
+    results `home`.
+    """
     npz_file = home / require_below(trajectory)
     videos = sorted(npz_file.parent.glob(f"{escape(npz_file.stem)}_*.mp4"))
     return [str(video.relative_to(home)) for video in videos]
 
 
 def require_there(path: Path) -> Path:
-    """Return the `path` of an episode's file.
+    """Check that an episode's file exists, and return its `path`.
 
     Raises:
         ConfigError: The file is missing, for example in a partial copy.
     """
     if not path.is_file():
         raise ConfigError(
-            f"{path}: expected a file, as results.db names one there, got none; copy the folder "
-            f"again from where it was evaluated, with its {VIDEOS}/ and {TRAJECTORIES}/"
+            f"{path}: expected the file that results.db names, got none; copy the folder again "
+            f"from its original place, with its {VIDEOS}/ and {TRAJECTORIES}/"
         )
     return path
 
@@ -110,8 +113,8 @@ def outcome(result: EpisodeResult) -> str:
 
 
 def require_folder_of(file: Path) -> None:
-    """Raise `ConfigError` if this file cannot be written, as it is a folder or its folder does not
-    exist.
+    """Raise `ConfigError` if this file cannot be written because it is a folder, or because its
+    folder does not exist.
     """
     if file.is_dir():
         raise ConfigError(f"{file}: expected a file, got a folder; add the name of a file")
@@ -123,7 +126,9 @@ def require_folder_of(file: Path) -> None:
 
 
 def require_folder(folder: Path) -> None:
-    """Raise `ConfigError` if this is a file or below a file, so that no folder can be made."""
+    """Raise `ConfigError` if this path is a file or is below a file, so that the folder cannot be
+    created.
+    """
     blocking = next((path for path in (folder, *folder.parents) if path.exists()), None)
     if blocking is not None and not blocking.is_dir():
         raise ConfigError(f"{folder}: expected a folder, got the file {blocking}; choose another")
@@ -131,8 +136,8 @@ def require_folder(folder: Path) -> None:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Return a context manager that yields a path for writing and renames the file to `path` when
-    it is complete. Missing folders are made.
+    """Return a context manager that yields a temporary path for writing, and renames the file to
+    `path` when it is complete. Missing folders are created.
 
     If writing fails, the unfinished file is removed, since other files need the space on a full
     disk.
@@ -153,16 +158,16 @@ def link_or_copy(source: Path, target: Path) -> None:
     with whole(target) as unfinished_path:
         try:
             os.link(source, unfinished_path)
-        except OSError:  # another file system, or one without hard links
+        except OSError:  # `target` is on another file system, or the file system has no hard links
             shutil.copyfile(source, unfinished_path)
 
 
 @contextmanager
 def storing(folder: Path) -> Iterator[None]:
-    """Return a context manager that replaces errors of the disk of `folder` with `StorageFailed`,
-    which names cause and cure. Other errors are not changed.
+    """Return a context manager that replaces disk errors in `folder` with `StorageFailed`, whose
+    message contains the cause and the cure. Other errors are unchanged.
 
-    Use it around code in which only the disk raises `OSError`.
+    Use the context only around code in which every `OSError` is a disk error.
     """
     try:
         yield
@@ -211,8 +216,8 @@ def versions() -> dict[str, Any]:
 
 
 def policy_code(metadata: dict[str, Any]) -> GitState | None:
-    """Return the git state of a policy's code, with its diff; None if this process has another
-    version of the code than the server.
+    """Return the git state of a policy's code, with its diff; None if this process does not have
+    the server's version of the code.
     """
     policy = metadata.get("policy")
     if not isinstance(policy, str):
@@ -224,8 +229,8 @@ def policy_code(metadata: dict[str, Any]) -> GitState | None:
 
 
 def save_diffs(out: Path, git_states: Iterable[GitState | None]) -> None:
-    """Write the diff between each git state and its commit to `out/provenance/SHA256.diff`, unless
-    the file exists.
+    """Write the uncommitted changes of each git state to `out/provenance/SHA256.diff`, unless the
+    file exists.
     """
     for code in git_states:
         if code is None or code.diff_sha256 is None:

@@ -1,1 +1,1 @@
-"""An episode: its loop, its clock, and the attribution of its errors."""
+"""The execution of an episode: the loop, the clock, and the attribution of errors."""

@@ -37,7 +37,7 @@ from vlagents_ray.interface import POLICY, Act, Agent, Obs
 from vlagents_ray.validation import check_action
 
 _LITTLE_ENDIAN = np.dtype("<f4")
-_FIELDS_OF_RESULT = (  # those that `EpisodeStats` and a result have in common
+_FIELDS_OF_RESULT = (  # names of the fields that `EpisodeStats` and `EpisodeResult` share
     "key",
     "steps",
     "episode_return",
@@ -66,7 +66,7 @@ class EpisodeStats:
     ending: Ending = "error"
     instructions: list[str] = field(
         default_factory=list
-    )  # of each task so far; the last is current
+    )  # instruction of each task so far; the last one is current
     checkpoint: str | None = None
     weights: str | None = None
     revision: str | None = None
@@ -80,11 +80,11 @@ class EpisodeStats:
     policy_seconds: float = 0.0
     latency_ms: list[float] = field(default_factory=list)
     ticks_waited: int = 0
-    timeliness: Timeliness | None = None  # None where the environment waits for the policy
+    timeliness: Timeliness | None = None  # None if the environment waits for the policy
     timing_ms: dict[str, list[float]] = field(default_factory=dict)
 
     def began(self, info: object) -> None:
-        """Record the checkpoint and the weights that the policy's reset named."""
+        """Record the checkpoint and the weights that the policy's reset returned."""
         fields_of_info = info if isinstance(info, dict) else {}
         for name in ("checkpoint", "weights", "revision"):
             value = fields_of_info.get(name)
@@ -97,12 +97,12 @@ class EpisodeStats:
             self.latency_ms.append(1e3 * latency_s)
 
         timing = act.info.get("timing", {})
-        # Each answer counts its share of a batch; a policy in this process computes during the
-        # whole wait.
+        # An answer counts only its share of a batch's time; a policy in this process computes
+        # during the whole wait.
         computed_ms = timing.get("inference_ms", 1e3 * seconds)
         self.policy_seconds += computed_ms / 1e3 / max(1, timing.get("batch_size", 1))
         for stage, value in timing.items():
-            if stage.endswith("_ms"):  # the batch size is not a time
+            if stage.endswith("_ms"):  # the batch size is not a duration
                 self.timing_ms.setdefault(stage, []).append(float(value))
 
         version = version_of(act)
@@ -168,18 +168,19 @@ Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy 
 class Diverged:
     """The outcome of an episode whose simulation diverged.
 
-    Its state or its reward is not a finite number, or the simulator raised an exception that says
-    so.
+    The state or the reward is not a finite number, or the simulator raised an exception that
+    reports the divergence.
     """
 
     error: VLAgentsError
-    # If the policy is the cause, as the simulation diverges again under the same actions.
+    # The result that applies if the simulation diverges again under the same actions, i.e. if the
+    # policy is the cause.
     result: EpisodeResult
 
 
 Outcome = EpisodeResult | VLAgentsError | Diverged
-# The observations whose images are used: all; those for which an action is requested; or none, as
-# the agent repeats recorded actions.
+# The observations whose images are used: "all"; "requested", those for which an action is
+# requested; or "none", if the agent repeats recorded actions.
 Images = Literal["all", "requested", "none"]
 # Called with the phase that begins and the number of steps so far.
 Watch = Callable[[Phase, int], None]
@@ -201,33 +202,34 @@ def run_episodes(
     watch: Watch = lambda _phase, _steps: None,
     images: Images = "all",
 ) -> list[Outcome]:
-    """Play the episodes `keys` together, at most `env.num_envs`, each with its own session.
+    """Run the episodes `keys` together, at most `env.num_envs`, each with its own session.
 
     `agent.act_batch` is called for all sessions that have no rows of a chunk left. Either `agent`
-    is a `RemoteAgent` and `sessions` come from its `sessions(n)`, or it is an initialized policy in
-    this process and they are copies of it. A single session may be `agent` itself, whose `act` is
-    then called. A finished episode is idle until all are. The policy is reset with each further
-    instruction of an environment with `several_tasks`.
+    is a `RemoteAgent` and `sessions` are results of its `sessions(n)`, or `agent` is an initialized
+    policy in this process and `sessions` are copies of it. A single session may be `agent` itself;
+    then its `act` is called. A finished episode is idle until all episodes are finished. In an
+    environment with `several_tasks`, the policy is reset with each further instruction.
 
     Args:
         sessions: The session of each episode.
         keys: Environment, number and seed of each episode.
-        execute: The rows of each action chunk that are executed, open loop; None: all.
-        clock: Real-time mode, in which each episode's time passes while the policy computes (see
+        execute: The number of rows of each action chunk that are executed, open loop; None: all.
+        clock: The real-time mode, in which simulated time passes while the policy computes (see
             `latency`); None: the environments wait for the policy.
         reset_options: The options of each reset of an environment.
         policy_options: The options of each reset of the policy.
-        observers: The observer of each episode, or none.
-        watch: Called before each phase that may take long.
-        images: The observations whose images are used; the environments may leave out others.
+        observers: The observer of each episode; may be empty.
+        watch: Called before each phase that may take a long time.
+        images: The observations whose images are used; the environments may leave out all other
+            images.
 
     Returns:
         An outcome for each key. A policy error ends only its own episode, with status
-        "policy_error". Where an episode failed by another error, such as `PolicyUnavailable`, the
-        error stands in place of the result; `Diverged` if its simulation diverged.
+        "policy_error". If an episode failed with another error, such as `PolicyUnavailable`, the
+        outcome is this error; if its simulation diverged, the outcome is `Diverged`.
 
     Raises:
-        ConfigError: The numbers of episodes and sessions differ, or there are fewer environments.
+        ConfigError: The numbers of episodes and sessions differ, or there are too few environments.
         EnvFailed: The simulator of all environments broke, which ends all episodes.
         InvalidAction: An action does not fit one of several environments that one simulator runs.
     """
@@ -272,7 +274,7 @@ def run_episodes(
     watch("policy reset", 0)
     _reset_policy(agent, episodes, contract, policy_options or {})
 
-    # Play until all are finished.
+    # Run until all episodes are finished.
     steps = 0
     playing = _unfinished(episodes)
     while playing:
@@ -315,18 +317,18 @@ class _Episode:
     stats: EpisodeStats
     observer: EpisodeObserver
     new_executor: Callable[[], ChunkExecutor]
-    obs: Obs  # the newest
-    ticks: deque[Tick] = field(default_factory=deque)  # before the next request
+    obs: Obs  # the newest observation
+    ticks: deque[Tick] = field(default_factory=deque)  # ticks to execute before the next request
     outcome: Outcome | None = None  # set once the episode is over
     _executor: ChunkExecutor = field(init=False)
-    _width: int | None = None  # numbers of an action
-    _done: bool = False  # the policy ends the episode with these ticks
+    _width: int | None = None  # number of values in an action
+    _done: bool = False  # whether the policy ends the episode after `ticks`
 
     def __post_init__(self) -> None:
         self._executor = self.new_executor()
 
     def began(self, answer: dict[str, Any] | Exception) -> None:
-        """Begin with the policy's answer to the reset of the session."""
+        """Begin the episode, with the policy's answer to the reset of the session."""
         try:
             with failures.policy_side("reset"):
                 if isinstance(answer, Exception):
@@ -336,13 +338,15 @@ class _Episode:
             self.failed(error)
 
     def instructed(self, instruction: str) -> None:
-        """Begin a further task, and drop the rest of the plan, which was for the last one."""
+        """Begin a further task, and drop the remaining plan of the previous task."""
         self.stats.instructions.append(instruction)
         self.ticks.clear()
         self._executor, self._done = self.new_executor(), False
 
     def request(self) -> Obs:
-        """Return the newest observation, with what observer and executor add to its info."""
+        """Return the newest observation, with the entries that observer and executor add to its
+        info.
+        """
         info = {**self.observer.request_info, **self._executor.request_info()}
         return replace(self.obs, info={**self.obs.info, **info}) if info else self.obs
 
@@ -356,7 +360,7 @@ class _Episode:
                 self.stats.acted(answer, seconds, latency_s)
 
             rows = Act(check_action(answer.action, contract)).rows()
-            # The contract of the environment may state no size.
+            # The contract of the environment may not declare a size.
             if self._width not in (None, rows.shape[1]):
                 raise InvalidAction(
                     f"action: expected {self._width} numbers in each row, as in the first action, "
@@ -374,8 +378,8 @@ class _Episode:
             self.failed(error)
 
     def stepped(self, step: failures.EnvStep, limit: int) -> None:
-        """Record that the next of `ticks` was executed; the episode may be over, also by the
-        `limit` of steps.
+        """Record that the next of `ticks` was executed, and set the outcome if the episode is over,
+        e.g. at the `limit` of steps.
         """
         self.observer.add_observation(step.obs)
         self.obs, stats = step.obs, self.stats
@@ -409,13 +413,13 @@ class _Episode:
         return tick
 
     def diverged(self, error: VLAgentsError) -> None:
-        """End the episode, as the simulation diverged at the next of `ticks`."""
+        """End the episode, because the simulation diverged at the next of `ticks`."""
         self._executed()
         cause = PolicyFailed(f"the simulation diverged, and again under the same actions: {error}")
         self.outcome = Diverged(error, self.stats.result(transport_of(self.session), cause))
 
     def failed(self, error: VLAgentsError) -> None:
-        """End the episode with an error; one of the policy is a result."""
+        """End the episode with an error; an error of the policy is recorded as a result."""
         if isinstance(error, PolicyFailed) and not isinstance(error, CheckpointFailed):
             self.outcome = self.stats.result(transport_of(self.session), error)
         else:
@@ -445,7 +449,7 @@ def _reset_policy(
     instructions = [episode.stats.instructions[-1] for episode in episodes]
     seeds = [key.seed if key.policy_seed is None else key.policy_seed for key in keys]
     all_options = {**options, "env": keys[0].env}
-    if hasattr(agent, "metadata"):  # a server also compares the contract, and answers 409
+    if hasattr(agent, "metadata"):  # a server also compares the contracts, and may answer 409
         all_options["contract"] = contract.to_json()
 
     answers: list[dict[str, Any] | Exception] = []
@@ -499,7 +503,9 @@ def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contr
 def _step(
     env: BatchEnv, episodes: Sequence[_Episode], playing: Sequence[_Episode], contract: Contract
 ) -> None:
-    """Execute the next tick of each episode that is playing; others are idle in the same step."""
+    """Execute the next tick of each running episode; finished episodes are idle in the same
+    step.
+    """
     acts: list[Act | None] = []
     for episode in episodes:
         is_playing = episode.outcome is None
@@ -513,7 +519,7 @@ def _step(
                 zip(episodes, observations, rewards, terminated, truncated, infos, strict=True)
             )
     except (EnvFailed, InvalidAction) as error:
-        # One simulator runs all environments, so that the error does not name the episode.
+        # One simulator runs all environments, so the error does not identify the episode.
         if len(playing) > 1:
             raise
         if failures.raised_by_divergence(error):
@@ -548,15 +554,15 @@ def _step(
 
 
 def transport_of(agent: Agent) -> str:
-    """Return the transport of an agent's observations: "local" for one in this process."""
+    """Return the transport of an agent's observations: "local" for an agent in this process."""
     return str(getattr(agent, "transport", "local"))
 
 
 def options_of_reset(
     env: Environment, episode: int, options: Mapping[str, Any] | None
 ) -> dict[str, Any] | None:
-    """Return the options for the environment's reset: the user's `options` override the
-    benchmark's.
+    """Return the options for the environment's reset: the user's `options` override the benchmark's
+    options.
     """
     of_benchmark = {} if env.init_states is None else {"init_state": episode % env.init_states}
     return of_benchmark | dict(options or {}) or None

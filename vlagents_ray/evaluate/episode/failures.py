@@ -1,8 +1,8 @@
-"""The attribution of errors: exceptions of simulator, policy and settings, and checks of an
-environment's outputs.
+"""The attribution of errors to simulator, policy or settings, and checks of an environment's
+outputs.
 
-Without these checks a wrong output would surface later, in the encoder or in the policy, as if it
-were an error there.
+Without these checks, a wrong output would cause an error later, in the encoder or in the policy,
+and would be attributed to them.
 """
 
 from __future__ import annotations
@@ -26,13 +26,15 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.validation import check_observation
 
 Cause = Literal["user", "policy", "worker", "operator"]
-# Ends of messages about the policy's server: the likely causes, and how to find the line of a
-# policy.
+# Ends of messages about the policy's server: the likely causes, and how to find the responsible
+# line of the policy.
 _CURES: dict[type[errors.VLAgentsError], str] = {
-    errors.ConnectionLost: "; or find the line that ends it in this process with --workers 0",
+    errors.ConnectionLost: (
+        "; or run the policy in this process with --workers 0, to find the line that ends it"
+    ),
     errors.DeadlineExceeded: (
-        "; in an evaluation, timeout_s is policy_timeout_s; or see where it hangs in this process "
-        "with --workers 0"
+        "; in an evaluation, timeout_s is policy_timeout_s; or run the policy in this process with "
+        "--workers 0, to find the line that hangs"
     ),
 }
 # Errors that the user can correct.
@@ -51,10 +53,10 @@ _USER = (
 )
 # Errors of the simulator; an `InvalidInput` reports an unusable observation of the environment.
 _WORKER = (errors.EnvFailed, errors.InvalidInput)
-# These subclasses of `InvalidInput` are errors of the connection to the policy.
+# Subclasses of `InvalidInput` that are errors of the connection to the policy.
 _POLICY = (errors.UnknownSession, errors.NotReset)
-# These errors of an environment are no breakdown: they report settings, a breach of its contract, a
-# missing package, or a rejected action.
+# Errors of an environment that are not a breakdown: they report wrong settings, a violation of its
+# contract, a missing package, or a rejected action.
 _FROM_ENV = (
     errors.ConfigError,
     errors.ContractMismatch,
@@ -69,16 +71,16 @@ class Failure:
     """The cause of a failed attempt, and the side that can correct it.
 
     "user": a mistake in the settings, which stops the evaluation; "policy": the connection to the
-    policy; "worker": the simulator or its process, which is then replaced, or a real robot;
+    policy; "worker": a real robot, or the simulator or its process, which is then replaced;
     "operator": the operator repeats a trial of a real robot.
     """
 
     cause: Cause
-    code: str  # the code of a class in `vlagents_ray.errors`
+    code: str  # the `code` of a class in `vlagents_ray.errors`
     message: str
     traceback: str = ""
-    log: str = ""  # the end of the worker's log, if it broke
-    # If the simulation diverged: the result if the policy is the cause.
+    log: str = ""  # the end of the worker's log, if the worker broke
+    # If the simulation diverged: the result that applies if the policy is the cause.
     diverged: EpisodeResult | None = None
     names_no_episode: bool = False  # whether another episode in the same simulator may be the cause
 
@@ -103,10 +105,10 @@ def explain(error: errors.VLAgentsError) -> Failure:
 
 
 def explain_batch(error: errors.VLAgentsError, episodes: int) -> Failure:
-    """Return the failure for an `error` that ended a number of `episodes` in one simulator.
+    """Return the failure for an `error` that ended `episodes` episodes in one simulator.
 
-    An action that the simulator rejects and a simulation that diverges belong to one of them, which
-    is not known.
+    If the simulator rejected an action or its simulation diverged, one of the episodes is the
+    cause, but it is unknown which.
     """
     if episodes > 1 and (isinstance(error, errors.InvalidAction) or raised_by_divergence(error)):
         return replace(explain(error), cause="worker", names_no_episode=True)
@@ -114,8 +116,8 @@ def explain_batch(error: errors.VLAgentsError, episodes: int) -> Failure:
 
 
 class _Side:
-    """A context that attributes exceptions to one side; it has no state, and may be entered
-    again.
+    """A context that attributes exceptions to one side, simulator or policy; it has no state, and
+    can be entered repeatedly.
     """
 
     __slots__ = ("_phase",)
@@ -128,13 +130,13 @@ class _Side:
 
 
 class env_side(_Side):  # noqa: N801 - a context manager
-    """Turn any exception of a simulator into `EnvFailed`, except for wrong settings and rejected
+    """Convert any exception of a simulator to `EnvFailed`, except for wrong settings and rejected
     actions.
     """
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         _raise_if_quit(error)
-        # At a reset, only the environment itself can have chosen an action that it rejects.
+        # During a reset, only the environment itself can have chosen the rejected action.
         refuses_own = self._phase == "reset" and isinstance(error, errors.InvalidAction)
         passes = isinstance(error, _FROM_ENV) and not refuses_own
         # ManiSkill raises SystemExit when an asset is missing.
@@ -143,7 +145,9 @@ class env_side(_Side):  # noqa: N801 - a context manager
 
 
 class policy_side(_Side):  # noqa: N801 - a context manager
-    """Turn any exception of a policy into `PolicyFailed`; this package's own errors pass."""
+    """Convert any exception of a policy to `PolicyFailed`, except for the errors of this
+    package.
+    """
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         _raise_if_quit(error)
@@ -154,7 +158,7 @@ class policy_side(_Side):  # noqa: N801 - a context manager
 
 
 def _raise_if_quit(error: BaseException | None) -> None:
-    """Raise `KeyboardInterrupt` if the user has left a debugger: that is no error of either
+    """Raise `KeyboardInterrupt` if the user has quit a debugger, which is not an error of either
     side.
     """
     if isinstance(error, BdbQuit):
@@ -162,7 +166,7 @@ def _raise_if_quit(error: BaseException | None) -> None:
 
 
 class EnvStep(NamedTuple):
-    """The outputs of one step."""
+    """The outputs of one step of an environment."""
 
     obs: Obs
     reward: float
@@ -172,8 +176,8 @@ class EnvStep(NamedTuple):
 
 
 def is_finite(obs: object, reward: object) -> bool:
-    """Return whether the numbers of a step's outputs are finite; those of a diverged simulation
-    are not.
+    """Return whether the numbers in a step's outputs are finite; a diverged simulation returns
+    numbers that are not.
     """
     values: list[Any] = [reward]
     if isinstance(obs, Obs):
@@ -182,9 +186,9 @@ def is_finite(obs: object, reward: object) -> bool:
     return all(np.isfinite(array).all() for array in arrays if array.dtype.kind == "f")
 
 
-# Words of simulators that raise an exception instead of returning a NaN: MuJoCo's "Nan, Inf or huge
-# value in QACC. The simulation is unstable", dm_control's "Physics state is invalid", SciPy's
-# "array must not contain infs or NaNs".
+# Words in the messages of simulators that raise an exception instead of returning a NaN: MuJoCo's
+# "Nan, Inf or huge value in QACC. The simulation is unstable", dm_control's "Physics state is
+# invalid", SciPy's "array must not contain infs or NaNs".
 _DIVERGENCE = re.compile(
     r"\b(nans?|infs?|(non-?|not )finite|diverge[ds]?|divergence|unstable|physics state is "
     r"invalid)\b",
@@ -193,8 +197,8 @@ _DIVERGENCE = re.compile(
 
 
 def raised_by_divergence(error: errors.VLAgentsError) -> bool:
-    """Return whether a simulator raised `error` because its simulation diverged, by its type or
-    its words.
+    """Return whether a simulator raised `error` because its simulation diverged, judging from the
+    error's type and message.
     """
     if not isinstance(error, errors.EnvFailed):
         return False
@@ -205,7 +209,7 @@ def raised_by_divergence(error: errors.VLAgentsError) -> bool:
 
 
 def checked_instruction(instruction: object, where: str) -> str:
-    """Return `instruction`; raises `EnvFailed` if it is not text."""
+    """Return `instruction`, or raise `EnvFailed` if it is not text."""
     if not isinstance(instruction, str):
         raise errors.EnvFailed(
             f"env {where}: expected the instruction as a str (empty if the task has none), got "
@@ -224,8 +228,8 @@ def checked_step(
     *,
     images: bool = True,
 ) -> EnvStep:
-    """Return the checked outputs of `EvalEnv.step`; without `images`, the environment may have left
-    these out.
+    """Check the outputs of `EvalEnv.step` and return them; without `images`, the environment may
+    have left out images.
 
     Raises:
         EnvFailed: The observation does not fit the environment's own contract, the reward is not a
@@ -249,11 +253,11 @@ def checked_step(
 
 
 def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = True) -> Obs:
-    """Return `obs`, checked against the environment's own `contract`.
+    """Check an observation against the environment's own `contract`, and return it.
 
     Raises:
-        ContractMismatch: The first observation does not fit: every episode would fail in the same
-            way.
+        ContractMismatch: The first observation does not fit, so every episode would fail in the
+            same way.
         EnvFailed: A number is not finite, or a later observation does not fit.
     """
     error_class: type[errors.VLAgentsError] = errors.EnvFailed
@@ -265,7 +269,7 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
             f"env {where}: expected an Obs as the observation, got {type(obs).__name__}"
         )
     for name, value in (("cameras", obs.cameras), ("state", obs.state), ("info", obs.info)):
-        if not isinstance(value, (dict, Mapping)):  # testing for a dict first is faster
+        if not isinstance(value, (dict, Mapping)):  # testing for `dict` first is faster
             raise error_class(
                 f"env {where}: expected a dict as the observation's {name}, got "
                 f"{type(value).__name__}"
@@ -279,7 +283,7 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
         raise error_class(
             f"env {where}: the observation contradicts the env's contract: {error}"
         ) from error
-    except TypeError as error:  # such as a gripper that is not a number
+    except TypeError as error:  # e.g. the gripper is not a number
         raise error_class(
             f"env {where}: expected a gripper in [0, 1], got {obs.gripper!r}"
         ) from error
@@ -288,8 +292,8 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
 
 def _number(reward: Any) -> float:
     try:
-        # The reward of a diverged simulation may be a NaN, which neither the results file nor JSON
-        # can hold.
+        # The reward of a diverged simulation may be NaN, which neither the results file nor JSON
+        # can represent.
         if math.isfinite(reward):
             return float(reward)
     except (TypeError, ValueError):
@@ -298,7 +302,9 @@ def _number(reward: Any) -> float:
 
 
 def _truth(value: object, name: str) -> bool:
-    """Return `value` as a bool, also from 0 or 1; raises for text, as "no" would be true."""
+    """Return `value` as a bool; 0 and 1 are accepted, but text raises an error, since "no" would be
+    true.
+    """
     if value is True or value is False:  # the usual case
         return value
     if isinstance(value, bool | np.bool_) or (isinstance(value, Real) and value in (0, 1)):

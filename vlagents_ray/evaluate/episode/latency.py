@@ -1,10 +1,10 @@
 """Real-time evaluation: the environment's clock runs while the policy computes.
 
 The clock is simulated, so the speed of the machine does not matter. An answer that took L seconds
-comes ceil(L * hz) ticks after its observation. The environment is stepped through these ticks with
-the actions that `ClockConfig.meanwhile` selects, and then with the answer's rows, beginning with
-the row that the chunk player would begin with (`vlagents_ray.chunking.buffer.ChunkBuffer`). A
-synchronous evaluation is the case L = 0.
+arrives ceil(L * hz) ticks after its observation. The environment executes these ticks with the
+actions that `ClockConfig.meanwhile` selects. Then it executes the answer's rows, beginning with the
+same row as the chunk player (`vlagents_ray.chunking.buffer.ChunkBuffer`). A synchronous evaluation
+is the case L = 0.
 """
 
 from __future__ import annotations
@@ -23,28 +23,29 @@ from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.interface import Obs
 
 _SYNCHRONOUS = ClockConfig(latency=0)
-_EXACTLY = 1e-9  # ticks: 1.1 s at 10 Hz are 11 ticks, though 1.1 * 10 > 11 in floating point
+# Tolerance in ticks: 1.1 s at 10 Hz are 11 ticks, although 1.1 * 10 > 11 in floating point.
+_EXACTLY = 1e-9
 
 
 class Tick(NamedTuple):
     """One step of the environment."""
 
     action: np.ndarray  # (D,) float32
-    waited: bool = False  # executed while waiting for an answer
-    starved: bool = False  # no row of an answer is executed
-    # Real-time mode: the time from the observation of which the action was computed, ms.
+    waited: bool = False  # whether it is executed while waiting for an answer
+    starved: bool = False  # whether the action is not a row of an answer
+    # Real-time mode: the time since the observation from which the action was computed, ms.
     age_ms: float | None = None
 
 
 class ChunkExecutor:
-    """Chooses the executed actions between two requests, in one episode."""
+    """Chooses the actions that are executed between two requests, in one episode."""
 
     def __init__(self, execute: int | None, clock: ClockConfig | None, env: Contract) -> None:
         """Begin an episode.
 
         Args:
-            execute: Rows of a chunk before the next request; None: all.
-            clock: Real-time mode; None: the environment waits for the policy.
+            execute: Number of rows of a chunk to execute before the next request; None: all.
+            clock: The real-time mode; None: the environment waits for the policy.
             env: The contract of the environment.
 
         Raises:
@@ -76,18 +77,18 @@ class ChunkExecutor:
 
         self._plan = ChunkBuffer()
         self._tick = 0  # the number of the next tick in real-time mode
-        self._last: np.ndarray | None = None  # (D,) action
+        self._last: np.ndarray | None = None  # the last action, (D,)
         self._delay = DelayEstimate()
 
     def latency_s(self, measured_s: float) -> float | None:
-        """Return the latency of an answer that took `measured_s`, s; None without a clock."""
+        """Return the latency of an answer that took `measured_s`, s; None if there is no clock."""
         if not self._real_time:
             return None
         return measured_s if self._clock.latency == "measured" else self._clock.latency
 
     def request_info(self) -> dict[str, Any]:
-        """Return the `Obs.info` for real-time chunking: the remaining rows; {} if there are none
-        or it is off.
+        """Return the `Obs.info` for real-time chunking, with the remaining rows; {} if no rows
+        remain or real-time chunking is off.
         """
         return self._plan.continuation(self._delay.ticks) if self._clock.real_time_chunking else {}
 
@@ -99,10 +100,10 @@ class ChunkExecutor:
         *,
         done: bool = False,
     ) -> Iterator[Tick]:
-        """Return the ticks until the next request, after an answer of `rows`, (H, D), with
-        `latency_s` and `info`.
+        """Return the ticks until the next request, given an answer with the rows `rows`, (H, D),
+        the latency `latency_s` and the info `info`.
 
-        After an answer with `done` there is no next request: all its rows are executed.
+        If the answer has `done`, no request follows, and all its rows are executed.
 
         Raises:
             ConfigError: No row is left for real-time chunking.
@@ -113,12 +114,12 @@ class ChunkExecutor:
             return
         if self._clock.real_time_chunking and not done and len(rows) <= (execute or len(rows)):
             raise ConfigError(
-                "clock.real_time_chunking: expected chunks that are longer than `execute`, got "
-                f"{len(rows)} rows, all of which are executed before the next request, so that "
-                "none is left to continue; lower `execute`, and leave it out of the policy"
+                f"clock.real_time_chunking: expected chunks that are longer than `execute`, got "
+                f"{len(rows)} rows, all of which are executed before the next request; lower "
+                f"`execute`, and do not set it in the policy"
             )
 
-        # The ticks between the observation and its answer.
+        # First, the ticks between the observation and the answer.
         ticks_waited = math.ceil(latency_s * self._hz - _EXACTLY)
         self._delay.add(ticks_waited)
         observed = self._tick
@@ -127,7 +128,8 @@ class ChunkExecutor:
         if self._plan.outruns(executed_at_request, info or {}):
             return
 
-        # The last row is always executed, else a policy slower than its chunks would never act.
+        # The last row is always executed; otherwise no action of a policy that is slower than its
+        # chunks would ever be executed.
         latest_start = self._plan.executed - len(rows) + 1
         start = max(executed_at_request, latest_start)
         self._plan.replace(rows, start if self._clock.align else None, observed)
@@ -142,7 +144,7 @@ class ChunkExecutor:
             step = self._plan.next if self._clock.meanwhile == "chunk" else None
             if step is None:
                 action = self._held(dim)
-                # A relative action that is repeated moves the robot on, so that the plan continues.
+                # A repeated relative action moves the robot further, so that the plan advances.
                 repeats = self._clock.meanwhile == "hold" and self._plan.executed > 0
                 if repeats and stopping(self._spec) == "zero":
                     self._plan.advance()
@@ -156,9 +158,9 @@ class ChunkExecutor:
 
         Args:
             action: Its action, (D,).
-            observed: The tick of the observation of which the action was computed; None for an
-                action in place of a row.
-            waited: Whether an answer is awaited.
+            observed: The tick of the observation from which the action was computed; None for an
+                action that is not a row of an answer.
+            waited: Whether the executor waits for an answer at this tick.
         """
         age_ms = None if observed is None else 1e3 * (self._tick - observed) / self._hz
         self._tick += 1
@@ -166,7 +168,7 @@ class ChunkExecutor:
         return Tick(action, waited, observed is None, age_ms)
 
     def _held(self, dim: int) -> np.ndarray:
-        """Return the action of a tick for which no row is left, (D,)."""
+        """Return the action of a tick for which no row remains, (D,)."""
         configured = self._clock.neutral
         if configured is None:
             still = neutral(self._spec, dim)

@@ -1,5 +1,5 @@
-"""A second pass over an episode by its actions, which renders the images that the first pass
-left out.
+"""A second pass over an episode, which repeats its actions and renders the images that the first
+pass left out.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from vlagents_ray.interface import Act, Agent, Obs
 
 
 class RecordedActions(Agent):
-    """Acts as in an earlier episode, whatever it observes."""
+    """An agent that returns the actions of an earlier episode, independently of the
+    observations.
+    """
 
     def __init__(self, actions: Sequence[np.ndarray]) -> None:
         """Begin with the first action.
@@ -58,16 +60,16 @@ def play_actions(
         env: The environments.
         key: The key of the episode.
         actions: Its actions, (D,) each; at least one.
-        observer: Gets the observations and the outcome of each action.
+        observer: Receives the observations and the outcome of each action.
         reset_options: The options of each reset of its suite.
         images: The observations whose images are used: "all" or "none".
-        watch: As for `run_episodes`.
+        watch: As in `run_episodes`.
 
     Returns:
         The result of the episode, in which all actions were executed.
 
     Raises:
-        EnvFailed: The simulator failed or diverged, or its episode ended earlier.
+        EnvFailed: The simulator failed or diverged, or the episode ended before its last action.
     """
     agent = RecordedActions(actions)
     [outcome] = run_episodes(
@@ -101,18 +103,18 @@ class PlayedEpisode(EpisodeObserver):
 
     @property
     def lacks_images(self) -> bool:
-        """Whether an observation lacks images that the first one has."""
+        """Whether an observation lacks images that the first observation has."""
         if not self._observations:
             return False
         names = self._observations[0].images.keys()
         return any(digests.images.keys() != names for digests in self._observations)
 
     def add_observation(self, obs: Obs) -> None:
-        """Keep the digests of an observation."""
+        """Store the digests of an observation."""
         self._observations.append(_Digests.from_obs(obs))
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Keep an action and its outcome."""
+        """Store an action and its outcome."""
         self._actions.append(np.array(action))
         self._outcomes.append((reward, success))
 
@@ -124,17 +126,17 @@ class PlayedEpisode(EpisodeObserver):
         watch: Watch,
         record: Callable[[Obs], None],
     ) -> str | None:
-        """Begin the episode in the first environment again, execute its actions, and render each
-        observation.
+        """Repeat the episode in the first environment: reset it, execute the actions, and render
+        each observation.
 
-        State, gripper, reward and success of every step, and the images of the first pass, must be
-        bit-identical, so that the new images show this episode.
+        State, gripper, reward and success of every step, and all images of the first pass, must be
+        bit-identical, so that the new images certainly show this episode.
 
         Args:
             env: The environments.
             key: The key of the episode.
             reset_options: The options of each reset of its suite.
-            watch: As for `run_episodes`.
+            watch: As in `run_episodes`.
             record: Called with each observation.
 
         Returns:
@@ -172,11 +174,13 @@ class _Comparison(EpisodeObserver):
         self._observations = observations
         self._outcomes = outcomes
         self._record = record
-        self._steps = -1  # before the reset
+        self._steps = -1  # -1 before the reset
         self._difference: str | None = None  # difference of the newest observation
 
     def add_observation(self, obs: Obs) -> None:
-        """Record an observation; raise `_DifferenceFound` if that of the reset has changed."""
+        """Record an observation; raise `_DifferenceFound` if the observation of the reset has
+        changed.
+        """
         self._steps += 1
         self._record(obs)
         first_pass = self._observations[self._steps]
@@ -197,13 +201,15 @@ class _Comparison(EpisodeObserver):
         raise _DifferenceFound(f"after {steps}, {difference} differs")
 
 
-# `play_again` with the environment.
+# A function that calls `play_again` with the environment.
 SecondPass = Callable[[PlayedEpisode, Callable[[Obs], None]], str | None]
 
 
 @dataclass(frozen=True, slots=True)
 class _Digests:
-    """The numbers of an observation, and the checksums of its images, by names for a message."""
+    """The numbers of an observation, and the checksums of its images, by the names that a message
+    uses.
+    """
 
     numbers: dict[str, Any]
     images: dict[str, int]
@@ -222,7 +228,7 @@ class _Digests:
         return cls(numbers, images)
 
     def difference(self, other: _Digests) -> str | None:
-        """Return the first name whose value `other` does not have; None if there is none."""
+        """Return the first name whose value differs in `other`; None if all values are equal."""
         for name, number in self.numbers.items():
             if other.numbers.get(name) != number:
                 return name

@@ -1,4 +1,4 @@
-"""The cases of an evaluation, each one policy at one checkpoint in one environment."""
+"""The cases of an evaluation; each case is one policy at one checkpoint in one environment."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from vlagents_ray.registry import env_class, env_suite, env_task
 
 @dataclass(frozen=True)
 class EvalCase:
-    """One policy, at one checkpoint, in one environment of a suite, with one success rate."""
+    """One policy, at one checkpoint, in one environment of a suite. A case has one success rate."""
 
     policy: PolicyConfig
-    step: int | None  # of training, in a sweep over checkpoints; or the version of pushed weights
+    step: int | None  # training step, in a sweep over checkpoints; or the version of pushed weights
     suite: SuiteConfig
     env: str  # full name
     worker: WorkerConfig
-    robot: RobotConfig | None = None  # the real robot; None: `env` is simulated
+    robot: RobotConfig | None = None  # the real robot; None if `env` is simulated
 
     @property
     def on_robot(self) -> tuple[RobotConfig, RobotTask]:
-        """The real robot and its task; only of a case on one."""
+        """The real robot and its task; raises an error for a simulated case."""
         if self.robot is None:
             raise TypeError(f"{self.env}: this case is simulated")
         return self.robot, self.robot.tasks[self.env]
@@ -50,7 +50,7 @@ class EvalCase:
 
     @property
     def name(self) -> tuple[str, str, str]:
-        """(policy_id, suite, env): no two cases of one evaluation have the same."""
+        """(policy_id, suite, env), which is unique among the cases of one evaluation."""
         return self.policy_id, self.suite.name, self.env
 
     @property
@@ -60,7 +60,7 @@ class EvalCase:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All that an episode depends on, apart from its number and seed."""
+        """All settings on which an episode depends, apart from its number and seed."""
         pushed = self.policy.pushed_weights
         robot = {}
         if self.robot is not None:
@@ -96,33 +96,31 @@ class EvalCase:
 
     @cached_property
     def place(self) -> str:
-        """Fingerprint of the environment; a worker runs cases with the same value without
-        making another one.
+        """Fingerprint of the environment; a worker runs all cases with the same value in the same
+        environment.
         """
         return fingerprint([self.env, self.suite.env_options, self.suite.num_envs, self.kind])
 
     @cached_property
     def program(self) -> Program:
-        """The present files of its environment: its code, and the files that its settings name."""
+        """The present files of the environment: its code, and the files that its settings name."""
         return env_program(self)
 
     @property
     def planned(self) -> int:
-        """The number of its episodes, for all seeds together."""
+        """The number of episodes of the case, for all seeds together."""
         return self.suite.episodes * len(self.suite.seeds)
 
 
 def env_program(case: EvalCase, code: Callable[[str], Program] = code_of_class) -> Program:
-    """Return the files of a case's environment, or of its robot; `code` returns those of a
-    class.
-    """
+    """Return the files of a case's environment or robot; `code` returns the files of a class."""
     if case.robot is not None:
         return code(case.on_robot[0].arm or "")
 
     cls = env_class(case.env)
     program = dict(code(f"{cls.__module__}:{cls.__name__}"))
 
-    # The module that registers the id of an environment of Gymnasium.
+    # For an environment of Gymnasium, add the module that registers its id.
     task = env_task(case.env) or ""
     namespace = task.rpartition(":")[0] or task.rpartition("/")[0]
     module = case.suite.env_options.get("module") or namespace
@@ -140,11 +138,11 @@ def policy_id(policy: str, step: int | None) -> str:
 
 
 def plan_cases(config: EvalConfig) -> list[EvalCase]:
-    """Return every case of `config`: by checkpoint, then by suite and env.
+    """Return all cases of `config`, ordered by checkpoint, then by suite and env.
 
-    Raises `UnknownEnv` for an unknown env. Raises `ConfigError` for an env that is listed twice
-    under one name, or in two equal suites, as their episodes would have the same keys; and for
-    names that differ only in characters that file names cannot have, as their episodes would have
+    Raises `UnknownEnv` for an unknown env. Raises `ConfigError` if an env is listed twice under one
+    name or in two equal suites, since its episodes would have the same keys. Also raises it if
+    names differ only in characters that file names cannot contain, since their episodes would have
     the same files.
     """
     robot = config.real_robot
@@ -170,7 +168,7 @@ def plan_cases(config: EvalConfig) -> list[EvalCase]:
 
 
 def _tasks_of_robot(robot: RobotConfig, pattern: str) -> list[str]:
-    """Return the tasks that match; raises `UnknownEnv` if there are none."""
+    """Return the robot's tasks that match a pattern; raises `UnknownEnv` if no task matches."""
     tasks = fnmatch.filter(robot.tasks, pattern)
     if not tasks:
         raise UnknownEnv(
@@ -181,13 +179,13 @@ def _tasks_of_robot(robot: RobotConfig, pattern: str) -> list[str]:
 
 
 def _require_distinct(cases: list[EvalCase]) -> None:
-    """Raise `ConfigError` if two cases have one name, the same files, or the same episodes."""
+    """Raise `ConfigError` if two cases have the same name, the same files, or the same episodes."""
     names = Counter(case.name for case in cases)
     repeated = sorted({env for (_, _, env), number in names.items() if number > 1})
     if repeated:
         raise ConfigError(
-            f"suites: expected each case once in suites of one name, got {repeated} in two; give "
-            "each suite another `name`"
+            f"suites: expected each case once in suites of one name, got {repeated} twice; give "
+            f"each suite a different `name`"
         )
 
     names_by_path: dict[tuple[str, ...], tuple[str, ...]] = {}
@@ -205,7 +203,7 @@ def _require_distinct(cases: list[EvalCase]) -> None:
     if repeated:
         raise ConfigError(
             f"suites: expected each episode once, got {repeated} in two suites with the same "
-            "settings; leave them out of one of the two"
+            f"settings; remove these envs from one of the suites"
         )
 
 
@@ -217,7 +215,8 @@ def require_envs(cases: Iterable[EvalCase]) -> None:
 
 
 def expand(pattern: str) -> list[str]:
-    """Return the envs of a name: itself, or with `*` the simulator's matching tasks.
+    """Return the envs that a name stands for: the env of this name or, if the name contains `*`,
+    the simulator's matching tasks.
 
     Raises `UnknownEnv` for a simulator that is not registered, or if no task matches.
     """

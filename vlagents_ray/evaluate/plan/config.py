@@ -1,4 +1,6 @@
-"""The settings of an evaluation: closed, typed; policies x checkpoints x suites x tasks x seeds."""
+"""The settings of an evaluation, which are policies x checkpoints x suites x tasks x seeds. All
+models are typed and reject unknown fields.
+"""
 
 from __future__ import annotations
 
@@ -40,20 +42,20 @@ Count = Annotated[int, Field(ge=1, le=MOST_EPISODES)]
 Retries = Annotated[int, Field(ge=0, le=MOST_RETRIES)]
 Rows = Annotated[int, Field(ge=1, le=MOST_ROWS)]
 Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
-Step = Annotated[int, Field(ge=0, le=MOST_STEP)]  # of training; also a version of weights
+Step = Annotated[int, Field(ge=0, le=MOST_STEP)]  # training step, or version of weights
 Workers = Annotated[int, Field(ge=0, le=MOST_WORKERS)]
-Resources = Annotated[float, Field(ge=0, le=MOST_CPUS)]  # CPUs or GPUs
+Resources = Annotated[float, Field(ge=0, le=MOST_CPUS)]  # number of CPUs or GPUs
 Seconds = Annotated[float, Field(gt=0, le=MOST_S)]
 Hertz = Annotated[float, Field(gt=0, le=10_000)]
 
 
 class _PlanModel(BaseModel):
-    # Errors are logged, and so they must not show the input.
+    # Errors are logged, so they must not contain the input.
     model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
 
 class StepRange(_PlanModel):
-    """Training steps at equal distances, the last one included."""
+    """Training steps at equal distances, including the last step."""
 
     first: Step = Field(
         description="The first step.",
@@ -152,7 +154,9 @@ class PolicyConfig(_PlanModel):
     def _once(cls, steps: list[int]) -> list[int]:
         repeated = sorted({step for step in steps if steps.count(step) > 1})
         if repeated:
-            raise ValueError(f"{repeated} named twice; name each step once")
+            raise ValueError(
+                f"expected each step once, got {repeated} twice; remove the repetition"
+            )
         return steps
 
     @model_validator(mode="after")
@@ -169,7 +173,7 @@ class PolicyConfig(_PlanModel):
         conflicts = sorted(reserved & self.options.keys())
         if conflicts:
             raise ValueError(
-                "options: expected none that the evaluation sets for each episode, got "
+                f"options: expected no options that the evaluation sets for each episode, got "
                 f"{conflicts}; leave them out"
             )
         return self
@@ -243,8 +247,8 @@ class ClockConfig(_PlanModel):
 
 
 class StopConfig(_PlanModel):
-    """The rule by which a case stops early (see `confidence_sequence`): `target`, `width`, or
-    whichever comes first.
+    """The rule for stopping a case early (see `confidence_sequence`): by `target`, by `width`, or
+    by the one that is reached first.
     """
 
     error_rate: float = Field(
@@ -329,21 +333,25 @@ class SuiteConfig(_PlanModel):
     def _distinct(cls, envs: list[str]) -> list[str]:
         repeated = sorted({name for name in envs if envs.count(name) > 1})
         if repeated:
-            raise ValueError(f"{repeated} named twice; name each env once and raise `episodes`")
+            raise ValueError(
+                f"expected each env once, got {repeated} twice; remove the repetition, and raise "
+                "`episodes`"
+            )
         return envs
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.clock is not None and self.clock.latency == "measured" and self.num_envs > 1:
             raise ValueError(
-                "num_envs: expected 1 with a measured clock.latency, which would be that of the "
-                f"whole batch, got {self.num_envs}; set 1, or give the latency in seconds"
+                f"num_envs: expected 1 with a measured clock.latency, as a batch has only one "
+                f"latency, got {self.num_envs}; set 1, or give the latency in seconds"
             )
         for low, high in itertools.pairwise(sorted(self.seeds)):
             if high - low < self.episodes:
                 raise ValueError(
                     f"seeds: expected seeds at least {self.episodes} apart, as each runs "
-                    f"{self.episodes} episodes, got {low} and {high}, which would run some twice"
+                    f"{self.episodes} episodes, got {low} and {high}, with which some episodes "
+                    f"would run twice"
                 )
         return self
 
@@ -551,19 +559,19 @@ class EvalConfig(_PlanModel):
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(
-                f"policies: expected different names, got {repeated} twice; give each another "
-                "`name`"
+                f"policies: expected different names, got {repeated} twice; give each policy a "
+                f"different `name`"
             )
         return policies
 
     @property
     def real_robot(self) -> RobotConfig | None:
-        """The robot, if the episodes run on a real one; otherwise None."""
+        """The robot, if the episodes run on a real robot; otherwise None."""
         return self.robot if self.robot is not None and self.robot.arm is not None else None
 
 
 def canonical(value: object) -> str:
-    """Return JSON with sorted keys and no spaces, so that equal values give equal text."""
+    """Return JSON with sorted keys and no spaces, so that equal values have equal texts."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 

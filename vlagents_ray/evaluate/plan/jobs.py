@@ -1,4 +1,4 @@
-"""Episodes as keyed jobs, and the common queue of all workers."""
+"""Jobs, which are attempts at episodes identified by keys, and the common queue of all workers."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 
 @dataclass(frozen=True, slots=True)
 class EpisodeKey:
-    """Everything that determines an episode: two runs of one key give the same episode on any
-    machine.
+    """Everything that determines an episode: two runs with the same key give the same episode on
+    any machine.
     """
 
-    env: str  # full name, suite and task
-    episode: int  # its number within the env, from 0
-    seed: int  # of the resets of env and policy
+    env: str  # full name of the env, with simulator and task
+    episode: int  # number of the episode within the env, from 0
+    seed: int  # seed of the resets of env and policy
     settings: str  # fingerprint of everything else that changes the outcome
-    # The seed of the policy's reset, where it differs from the env's; None: `seed`.
+    # The seed of the policy's reset, if it differs from the env's; None: `seed`.
     policy_seed: int | None = None
 
     def __str__(self) -> str:
@@ -35,11 +35,12 @@ class Job:
     key: EpisodeKey
     case: EvalCase
     attempt: int = 1
-    # Whether it runs without others in its simulator, so that an error names this episode.
+    # Whether the job runs without other episodes in its simulator, so that an error belongs to this
+    # episode.
     alone: bool = False
 
     def again(self, *, alone: bool = False) -> Job:
-        """Return the next attempt at the same episode, which stays `alone`."""
+        """Return the next attempt at the same episode; once set, `alone` stays set."""
         return replace(self, attempt=self.attempt + 1, alone=self.alone or alone)
 
 
@@ -55,10 +56,10 @@ def plan_jobs(cases: Iterable[EvalCase]) -> list[Job]:
 
 
 class JobQueue:
-    """Waiting jobs by environment, so that a worker can keep its environment."""
+    """A queue of waiting jobs by environment, so that a worker can keep its environment."""
 
     def __init__(self, jobs: Iterable[Job]) -> None:
-        self._waiting: dict[str, deque[Job]] = {}  # by place
+        self._waiting: dict[str, deque[Job]] = {}  # waiting jobs by place
         self._kinds: dict[str, str] = {}  # place -> kind
         for job in jobs:
             self.put(job)
@@ -67,20 +68,20 @@ class JobQueue:
         return sum(map(len, self._waiting.values()))
 
     def put(self, job: Job) -> None:
-        """Queue a job behind the others."""
+        """Queue a job behind all others of its environment."""
         self._of(job).append(job)
 
     def put_back(self, job: Job) -> None:
-        """Queue a further attempt, ahead of the episodes that have not been tried."""
+        """Queue a repeated attempt, ahead of episodes without an attempt."""
         self._of(job).appendleft(job)
 
     def take(self, kind: str, made: str | None, working: Mapping[str, int]) -> tuple[Job, ...]:
-        """Return the next jobs for a worker of `kind` with the env at place `made`; none if no job
-        of its kind waits.
+        """Return the next jobs for a worker of kind `kind` whose env is at place `made`; empty if
+        no job of this kind waits.
 
-        They are of one case, as many as run at once. A worker keeps its env while that has
-        episodes; then it takes the place with the most waiting jobs for each worker, by `working`,
-        the number of busy workers at each place.
+        The jobs belong to one case, and run at the same time. A worker keeps its env while the env
+        has waiting episodes. Then it changes to the place with the most waiting jobs per busy
+        worker; `working` contains the number of busy workers at each place.
         """
         if made is not None and self._waiting.get(made):
             return self._first(made)
@@ -97,12 +98,12 @@ class JobQueue:
     def needs_worker(
         self, workers: Mapping[str, int], unoccupied: Mapping[str, int]
     ) -> EvalCase | None:
-        """Return a case for one more worker; None if the `unoccupied` ones suffice.
+        """Return a case for one more worker; None if the `unoccupied` workers suffice.
 
-        Both arguments count workers by kind. The case is of the kind with the most waiting jobs for
-        each of the `workers`.
+        Both arguments count workers by kind. The case belongs to the kind with the most waiting
+        batches per worker.
         """
-        batches: Counter[str] = Counter()  # waiting ones, by kind
+        batches: Counter[str] = Counter()  # number of waiting batches by kind
         for place, jobs in self._waiting.items():
             if jobs:
                 batches[self._kinds[place]] += math.ceil(len(jobs) / jobs[0].case.suite.num_envs)
@@ -118,7 +119,7 @@ class JobQueue:
         return self._waiting[place][0].case
 
     def drop(self, settings: str) -> int:
-        """Remove the waiting jobs of the case with this fingerprint; returns their number."""
+        """Remove the waiting jobs of the case with this fingerprint, and return their number."""
         before = len(self)
         for place, jobs in self._waiting.items():
             self._waiting[place] = deque(job for job in jobs if job.key.settings != settings)
@@ -131,7 +132,7 @@ class JobQueue:
         ]
 
     def _first(self, place: str) -> tuple[Job, ...]:
-        """Take the first job at a place, and those that may run together with it."""
+        """Remove and return the first job at a place and the jobs that may run together with it."""
         jobs = self._waiting[place]
         first = jobs.popleft()
         taken = [first]

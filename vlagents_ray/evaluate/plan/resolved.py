@@ -1,4 +1,6 @@
-"""The plan of an evaluation, of rollouts or of trials, resolved once from its configuration."""
+"""The plan of an evaluation, of rollouts or of trials, which is resolved once from the
+configuration.
+"""
 
 from __future__ import annotations
 
@@ -22,20 +24,21 @@ from vlagents_ray.evaluate.plan.config import (
 from vlagents_ray.ray_tools.private import node_of_this_process
 from vlagents_ray.registry import registered_class, require_needs
 
-VARIABLES = "env_vars"  # in Ray's runtime environment
-# Planned steps up to which Ray's start, some seconds, is a large part of the time.
+VARIABLES = "env_vars"  # key of Ray's runtime environment
+# Number of planned steps up to which the start of Ray, some seconds, is a large part of the
+# duration.
 SHORT_STEPS = 10_000
-_STEPS = 300  # of an episode, if the options of its environment name no `max_steps`
+_STEPS = 300  # assumed steps of an episode if the environment's options have no `max_steps`
 
 
 @dataclass(frozen=True, slots=True)
 class TimeLimits:
-    """The times after which a call is given up, in seconds."""
+    """The time limits of calls, in seconds."""
 
-    make_s: float  # making an env, imports and shaders included
+    make_s: float  # creating an env, including imports and shaders
     env_s: float  # one reset or step
-    policy_s: float  # one reset or act of the policy
-    connect_s: float  # reaching the policy, a restart of its server included
+    policy_s: float  # one call of the policy's `reset` or `act`
+    connect_s: float  # connecting to the policy, including a restart of its server
     place_s: float  # until the cluster has resources for a worker
 
     def of_phase(self, phase: str) -> float:
@@ -49,29 +52,32 @@ class TimeLimits:
 
 @dataclass(frozen=True, slots=True)
 class ResolvedPlan:
-    """Everything that is decided before the first episode; only `resolve` makes it.
+    """All decisions that are made before the first episode; only `resolve` creates a plan.
 
-    All code that runs, records or shows the episodes uses this value, and resolves nothing again.
+    All code that runs, records or shows the episodes uses this plan, and resolves nothing again.
     """
 
-    # Each has its policy, checkpoint, environment, seeds, worker settings and fingerprint.
+    # Each case contains its policy, checkpoint, environment, seeds, worker settings and
+    # fingerprint.
     cases: tuple[EvalCase, ...]
-    # Ray actors, each with an environment; with 0, the episodes run in this process without Ray.
+    # Number of Ray actors, each with an environment; 0: the episodes run in this process without
+    # Ray.
     workers: int
     limits: TimeLimits
-    retries: int  # further attempts at an episode after an infrastructure failure
-    # Lost episodes, or errors of policies, in a row that end everything; 0: no number of them does.
+    retries: int  # number of further attempts at an episode after an infrastructure failure
+    # Number of lost episodes, or of policy errors, in a row that ends the run; 0: no limit.
     abort_after: int
     video: EpisodeChoice
     record: EpisodeChoice
     record_images: RecordedImages
-    stop: StopConfig | None  # the rule by which a case stops early
+    stop: StopConfig | None  # the rule for stopping a case early
     trackers: Mapping[str, type[Any]]  # the classes of the trackers, by name
     tracking: TrackingConfig
-    out: Path  # folder of the results
+    out: Path  # the folder of results
     resume: bool
     accept_changes: bool
-    settings: EvalConfig  # for the record of the run, and for the plan of a training's next steps
+    # For the record of the run, and for the plans of later steps of a training.
+    settings: EvalConfig
 
     @property
     def policies(self) -> list[PolicyConfig]:
@@ -84,22 +90,22 @@ def resolve(config: EvalConfig, workers: int | None = None) -> ResolvedPlan:
 
     Args:
         config: The configuration.
-        workers: The number of workers, where it is decided already; None: `chosen_workers`. A
-            robot's trials need none.
+        workers: The number of workers, if it is already decided; None: `chosen_workers`. Trials on
+            a robot need no workers.
 
     Returns:
         The plan, whose workers are decided and whose envs and trackers are known.
 
     Raises:
-        ConfigError: Two cases are the same, an env does not take its options, a tracker is not
-            registered, or `config.workers` is 0 and something needs Ray.
+        ConfigError: Two cases are equal, an env rejects its options, a tracker is not registered,
+            or `config.workers` is 0 although the evaluation needs Ray.
         MissingDependency: The package of a tracker is not installed.
-        UnknownEnv: There is no such env.
+        UnknownEnv: An env is unknown.
     """
     cases = tuple(plan_cases(config))
     require_envs(cases)
     settings = config
-    if config.real_robot is not None:  # its trials run in this process
+    if config.real_robot is not None:  # trials run in this process
         workers = 0
     else:
         workers = chosen_workers(config, cases) if workers is None else workers
@@ -132,12 +138,12 @@ def resolve(config: EvalConfig, workers: int | None = None) -> ResolvedPlan:
 
 
 def chosen_workers(config: EvalConfig, cases: Sequence[EvalCase]) -> int:
-    """Return `config.workers` or, if that is None, 0 for a short evaluation that needs no Ray, else
-    1.
+    """Return `config.workers`. If it is None, return 0 for a short evaluation that needs no Ray,
+    otherwise 1.
 
-    A single worker runs one episode after another, as this process does, so that Ray adds its
-    start and a message to each call of the policy. In return, a simulator that crashes or hangs is
-    replaced, which a long evaluation needs. Ray is also chosen if this process is in a cluster or
+    A single worker runs one episode after another, like this process, but Ray adds its start-up
+    time and a message to each call of the policy. In return, Ray replaces a simulator that crashes
+    or hangs, which a long evaluation needs. Ray is also chosen if this process is in a cluster or
     `RAY_ADDRESS` names one, and for workers with a GPU.
 
     Args:
@@ -145,7 +151,7 @@ def chosen_workers(config: EvalConfig, cases: Sequence[EvalCase]) -> int:
         cases: Its cases.
 
     Raises:
-        ConfigError: `config.workers` is 0, and something needs Ray.
+        ConfigError: `config.workers` is 0, although the evaluation needs Ray.
     """
     reasons = _reasons_for_ray(config, cases)
     if config.workers == 0 and reasons:
@@ -166,7 +172,7 @@ def chosen_workers(config: EvalConfig, cases: Sequence[EvalCase]) -> int:
 
 
 def _reasons_for_ray(config: EvalConfig, cases: Sequence[EvalCase]) -> list[str]:
-    """Return why the evaluation cannot run without Ray, one reason an entry."""
+    """Return the reasons why the evaluation needs Ray."""
     reasons = []
     for policy in config.policies:
         for url in (policy.url, policy.source):
@@ -181,7 +187,7 @@ def _reasons_for_ray(config: EvalConfig, cases: Sequence[EvalCase]) -> list[str]
 
 
 def _tracker_classes(names: Sequence[str]) -> Mapping[str, type[Any]]:
-    """Return the classes of trackers, each registered or given as "module:Class", by name."""
+    """Return the classes of trackers by name; each name is registered or "module:Class"."""
     classes = {}
     for name in names:
         classes[name] = registered_class("trackers", name)
