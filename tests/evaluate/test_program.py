@@ -219,7 +219,7 @@ def test_a_worker_that_has_other_files_is_refused_also_if_changes_are_accepted(
         program = store.cases[0].program | {"prog_env.py": "sha256:0"}
         with pytest.raises(
             ConfigError,
-            match=r"(?s)expected the files of this process on the worker at far, got others.*prog_env.py was .*, is sha256:0",
+            match=r"(?s)expected the files of this process on the worker at far, got other files.*prog_env.py was .*, is sha256:0",
         ):
             store.note_env(store.cases[0].place, EnvInfo({}, {}, program=program, host="far"))
 

@@ -1,4 +1,6 @@
-"""Runs an evaluation: it dispatches episodes, retries them, records results, and stops cleanly."""
+"""Runs an evaluation: dispatches episodes, repeats failed attempts, records results, and stops
+cleanly.
+"""
 
 from __future__ import annotations
 
@@ -42,13 +44,14 @@ from vlagents_ray.policies.base.program import Program
 from vlagents_ray.ray_tools.signals import StopRequest, stop_signals
 
 log = logging.getLogger(__name__)
-POLL_S = 0.25  # longest time until a signal is handled, s
-MARGIN = 1.25  # the next episode may take this many times as long as the longest so far
-CLOSING_S = 10.0  # time for workers to close their simulators and to write the report, s
+POLL_S = 0.25  # maximum time until a signal is handled, s
+MARGIN = 1.25  # the next episode may take this many times as long as the longest finished episode
+CLOSING_S = 10.0  # time reserved for closing the workers' simulators and writing the report, s
 
 
 class EvaluationInterrupted(KeyboardInterrupt):
-    """Ctrl-C or SIGTERM ended the evaluation. Finished episodes are kept, and `resume` continues.
+    """Ctrl-C or SIGTERM ended the evaluation. Finished episodes are kept, and `resume` continues
+    with the remaining episodes.
 
     Attributes:
         summary: The summary of the finished episodes.
@@ -66,8 +69,8 @@ class EvaluationInterrupted(KeyboardInterrupt):
 
 
 class OutOfTime(EvaluationInterrupted):
-    """No further episode would have ended by `end_at`. As after an interruption, `resume` continues
-    the evaluation.
+    """No further episode would have ended before `end_at`. As after an interruption, `resume`
+    continues the evaluation.
     """
 
     why = "out of time"
@@ -83,21 +86,24 @@ def evaluate(
 ) -> Summary:
     """Run every episode of `config` that has no result yet, and write the results to `config.out`.
 
-    Episodes run in Ray actors: in the cluster of this process, otherwise in the cluster of
+    Episodes run in Ray actors: in the cluster of this process, otherwise in the cluster at
     `RAY_ADDRESS`, otherwise in a local cluster that ends with the run. If `config.workers` is 0,
-    they run in this process, on this thread, without time limits; a short evaluation does that by
-    default (see `chosen_workers`). The results are the same. Each worker uses the policy at its
-    `url`, or an agent that it makes with `agent_factory`. Even if an exception is raised, recorded
-    episodes are kept, and summary.json and report.html are written if the disk has space.
+    the episodes run in this process, on this thread, without time limits; this is the default for a
+    short evaluation (see `chosen_workers`). The results are the same. Each worker uses the policy
+    at the policy's `url`, or an agent that it creates with `agent_factory`. Even if an exception is
+    raised, recorded episodes are kept, and summary.json and report.html are written if the disk has
+    space.
 
     Args:
         config: The policies, the envs, and the folder of results.
-        agent_factory: Called in each worker to make its agent, or a mapping of such functions by
-            the names of policies; by default, an agent is a connection to the policy's `url`.
-        progress: Shows the progress (`progress_for`); by default nothing is shown.
-        only: (number, seed) of the single episode of each env that runs; by default all run.
-        end_at: A time in seconds since 1970. No episode begins that would probably end later,
-            judging from the durations of earlier episodes.
+        agent_factory: A function that each worker calls to create its agent, or a mapping from
+            policy names to such functions; by default, an agent is a connection to the policy's
+            `url`.
+        progress: Shows the progress (see `progress_for`); by default, no progress is shown.
+        only: (number, seed) of the only episode that runs in each env; by default, all episodes
+            run.
+        end_at: A time in seconds since 1970. An episode does not begin if, judging from the
+            durations of earlier episodes, it would probably end later.
 
     Returns:
         The summary of all results in `config.out`, including those of earlier runs.
@@ -108,9 +114,9 @@ def evaluate(
         StorageFailed: The disk is full, or cannot be written to.
         EvaluationInterrupted: Ctrl-C or SIGTERM ended the evaluation; its subclass `OutOfTime` if
             `end_at` did.
-        VLAgentsError: `config.abort_after` episodes in a row were lost to infrastructure; it is the
-            last of these errors. `PolicyFailed` if as many episodes in a row ended with an error of
-            a policy.
+        VLAgentsError: `config.abort_after` episodes in a row were lost to infrastructure; the
+            exception is the last of these errors. It is `PolicyFailed` if as many episodes in a row
+            ended with an error of a policy.
     """
     return evaluate_plan(
         resolve(config), agent_factory=agent_factory, progress=progress, only=only, end_at=end_at
@@ -125,10 +131,10 @@ def evaluate_plan(
     only: tuple[int, int] | None = None,
     end_at: float | None = None,
 ) -> Summary:
-    """Evaluate as `evaluate` does, by a plan that is already resolved."""
+    """Evaluate like `evaluate`, with a plan that is already resolved."""
     if plan.settings.real_robot is not None:
         raise ConfigError(
-            "robot.arm: expected a plan in simulation, got one on a real robot; see "
+            "robot.arm: expected a plan in simulation, got a plan on a real robot; see "
             "vlagents_ray.evaluate.robot"
         )
     factory = agents(plan, agent_factory)
@@ -144,7 +150,7 @@ def evaluate_plan(
                 run = _Run(plan, store, progress or Progress(), tracking, only, end_at, local)
                 state, summary = run.play(factory)
         except BaseException:
-            # A second error of the disk probably has the same cause; the first one is reported.
+            # A second disk error probably has the same cause; the first error is reported.
             with contextlib.suppress(StorageFailed):
                 conclude(store, "stopped")
             raise
@@ -156,8 +162,8 @@ def evaluate_plan(
 
 
 def conclude(store: Store, state: str) -> Summary:
-    """Record the end of the run, and write its summary and its report."""
-    # Imported late, so that an evaluation begins sooner.
+    """Record the end of the run, and write the summary and the report."""
+    # Import this late, so that an evaluation begins sooner.
     from vlagents_ray.evaluate.report.page import FILE, write_report
 
     with storing(store.out):
@@ -169,7 +175,8 @@ def conclude(store: Store, state: str) -> Summary:
 
 
 def check(config: EvalConfig) -> None:
-    """Check the settings as `evaluate` does. It is called before a policy is served for it.
+    """Check the settings like `evaluate`. This is called before policies are served for an
+    evaluation.
 
     Raises:
         ConfigError: An env or a tracker is not registered or not installed, or the settings
@@ -180,15 +187,16 @@ def check(config: EvalConfig) -> None:
 
 def check_results(plan: ResolvedPlan) -> None:
     """Raise `ConfigError` if a plan contradicts the results in its folder."""
-    if plan.settings.real_robot is None:  # its results are written when all trials are judged
+    # On a robot, the results are written when all trials are judged.
+    if plan.settings.real_robot is None:
         Store(plan).close()
 
 
 class _Run(Consumer):
-    """Writes the results of one run, and shows its progress."""
+    """Writes the results of one run, and shows the progress."""
 
-    policy_cure = "mend the policy and evaluate it with a new --out, or raise abort_after"
-    loss_cure = "resume when this is mended (--resume)"
+    policy_cure = "correct the policy and evaluate it with a new --out, or raise abort_after"
+    loss_cure = "resume when the problem is solved (--resume)"
 
     def __init__(
         self,
@@ -204,19 +212,19 @@ class _Run(Consumer):
 
         Args:
             plan: The plan.
-            store: Its results, in which the run has begun.
+            store: The results, in which the run has begun.
             progress: Shows the progress.
             tracking: The plan's trackers.
-            only: As for `evaluate`.
-            end_at: As for `evaluate`.
-            local_programs: The files of agents that the workers make, by policy.
+            only: As in `evaluate`.
+            end_at: As in `evaluate`.
+            local_programs: The files of agents that the workers create, by policy.
         """
         self._plan = plan
         self._store = store
         self._progress = progress
         self._tracking = tracking
         self._local_programs = local_programs
-        self._checked_gpus = not plan.workers  # set when an env has first drawn
+        self._checked_gpus = not plan.workers  # whether the use of GPUs was checked, once
 
         results = Results.load(plan.out)
         self._recorded = {case.case_id: rate_of([case], "success_once") for case in results.cases}
@@ -231,14 +239,15 @@ class _Run(Consumer):
             if is_selected and str(job.key) not in finished and self.is_needed(job):
                 pending.append(job)
         self._driver = Driver(plan, pending, self)
-        self._left = Counter(job.key.settings for job in pending)  # by case
+        # Number of remaining episodes by case.
+        self._left = Counter(job.key.settings for job in pending)
         self._deadline = Deadline(end_at, (episode.result.seconds for episode in results.episodes))
 
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
         """Run all queued episodes, until a signal or the deadline ends the run.
 
-        The summary is written before the process disconnects from Ray: when Slurm cancels a job,
-        Ray stops responding immediately and the job is killed seconds later.
+        Write the summary before the process disconnects from Ray: when Slurm cancels a job, Ray
+        stops responding immediately, and the job is killed seconds later.
 
         Returns:
             The state of the run, and its summary.
@@ -260,7 +269,7 @@ class _Run(Consumer):
                             self._poll_pool(pool, stop)
                         if not stop.is_set():
                             pool.close()
-                    except KeyboardInterrupt:  # a signal during a call in this process
+                    except KeyboardInterrupt:  # a signal arrived during a call in this process
                         if not stop.is_set():
                             raise
                     except VLAgentsError as error:
@@ -285,11 +294,11 @@ class _Run(Consumer):
         for job, report in pool.wait(POLL_S):
             self._deadline.end(job)
             if report.failure is not None:
-                # A terminal or a service manager also signals workers and policies. Their failures
-                # do not count as attempts.
+                # A terminal or a service manager also sends the signal to workers and policies.
+                # Their failures do not count as attempts.
                 if stop.wait(late_s):
                     continue
-                # One wait suffices for all failures of a poll, of which a lost policy has many.
+                # One wait suffices for all failures of a poll; a lost policy causes many failures.
                 late_s = 0.0
             with storing(self._plan.out):
                 self._driver.take(job, report)
@@ -298,7 +307,7 @@ class _Run(Consumer):
         self._deadline.begin(jobs)
 
     def described(self, job: Job, report: Report) -> None:
-        """Record the policy, the environment and the worker of a report that describes them."""
+        """Record the policy, the environment and the worker that a report describes."""
         if report.policy is not None:
             name = job.case.policy.name
             local = {}
@@ -330,7 +339,9 @@ class _Run(Consumer):
             self._progress.retry(job, failure)
 
     def finished(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
-        """Write the files and the result of an episode, and stop its case if that suffices."""
+        """Write the files and the result of an episode, and stop the case if its outcomes
+        suffice.
+        """
         if artifacts.not_repeatable is not None:
             log.warning(
                 "%s: its video is not recorded, as its actions do not repeat it in the "
@@ -339,8 +350,8 @@ class _Run(Consumer):
                 artifacts.not_repeatable,
             )
 
-        # The files are written before the result. After a crash in between, the episode is repeated
-        # and overwrites them.
+        # Write the files before the result. After a crash in between, the episode is repeated and
+        # overwrites the files.
         videos, trajectory = save(self._plan.out, job.case, result, artifacts)
         self._store.record(result, job.attempt, videos, trajectory)
         self._progress.episode(job.case, result)
@@ -348,7 +359,8 @@ class _Run(Consumer):
         case_id = job.key.settings
         self._left[case_id] -= 1
         stopped_at = self._stopping.add(result)
-        if stopped_at is not None:  # its outcomes suffice; running episodes are finished
+        # The outcomes suffice; running episodes of the case are finished.
+        if stopped_at is not None:
             dropped = self._driver.queue.drop(case_id)
             self._left[case_id] -= dropped
             self._progress.stopped(job.case, stopped_at, dropped)
@@ -359,8 +371,8 @@ class _Run(Consumer):
 class Deadline:
     """Decides whether there is time for another episode.
 
-    The durations of episodes are measured in the driver, so they include the start of a simulator
-    and the wait for a policy.
+    The driver measures the durations of episodes, so they include the start of a simulator and the
+    wait for a policy.
     """
 
     def __init__(
@@ -369,7 +381,7 @@ class Deadline:
         known_s: Iterable[float] = (),
         now: Callable[[], float] = time.time,
     ) -> None:
-        """Start without running episodes.
+        """Create a deadline without running episodes.
 
         Args:
             end_at: The deadline in seconds since 1970; None for no deadline.
@@ -382,23 +394,23 @@ class Deadline:
         self._starts: dict[EpisodeKey, float] = {}  # start times of the running episodes
 
     def begin(self, jobs: Iterable[Job]) -> None:
-        """Note that a worker begins these episodes."""
+        """Record that a worker begins these episodes."""
         self._starts |= dict.fromkeys((job.key for job in jobs), self._now())
 
     def end(self, job: Job) -> None:
-        """Note that an attempt at this episode has ended, successful or not."""
+        """Record that an attempt at this episode has ended, successfully or not."""
         start = self._starts.pop(job.key, None)
         if start is not None:
             self._longest_s = max(self._longest_s, self._now() - start)
 
     @property
     def leaves_room(self) -> bool:
-        """Whether one more episode would end in time."""
+        """Whether one more episode would probably end in time."""
         return self._left_s() > self._longest_s * MARGIN
 
     @property
     def is_over(self) -> bool:
-        """Whether running episodes must be abandoned."""
+        """Whether the deadline has passed, so that running episodes must be abandoned."""
         return self._left_s() <= 0
 
     def _left_s(self) -> float:

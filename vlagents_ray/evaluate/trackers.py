@@ -1,4 +1,4 @@
-"""Shows an evaluation in trackers, such as wandb, while it runs. Plug-ins register the trackers."""
+"""Logging of a running evaluation to trackers, such as wandb. Plug-ins register the trackers."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from vlagents_ray.evaluate.results.summary import Group, summarize
 
 log = logging.getLogger(__name__)
 
-CLOSE_S = 120.0  # time for trackers to send their buffered values, s
+CLOSE_S = 120.0  # time limit for trackers to send their buffered values, s
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedPolicy:
-    """The subject of a tracker's run: one policy of one folder of results, with all its
+    """The content of one run in a tracker: one policy in one folder of results, with all its
     checkpoints.
     """
 
@@ -34,27 +34,30 @@ class TrackedPolicy:
     project: str
     group: str
     name: str  # the name of the policy
-    id: str  # reused when an evaluation resumes in this folder
+    id: str  # id of the tracker's run, reused when an evaluation in this folder is resumed
     # The settings (`evaluation`), the policy's identity (`served`) and the git states (`code`).
     config: dict[str, Any]
     diffs: Sequence[Path]  # files with the uncommitted changes of working trees
 
 
 class TrackerRun(Protocol):
-    """A run of a tracker, which plug-ins register by the entry-point group `vlagents_ray.trackers`.
+    """A run in a tracker. Plug-ins register trackers in the entry-point group
+    `vlagents_ray.trackers`.
 
-    Its methods may raise any error; the caller handles it.
+    The methods may raise any error; the caller handles it.
     """
 
     def __init__(self, subject: TrackedPolicy) -> None:
-        """Begin the run, or continue the run with this id."""
+        """Begin the run, or continue an existing run with this id."""
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Log values at a training step. If `step` is None, they are the only values of the run."""
+        """Log values at a training step. If `step` is None, these are the only values of the
+        run.
+        """
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Show videos of episodes. `label` consists of suite and env, as the prefix of the names of
-        values.
+        """Log videos of episodes. `label` consists of suite and env, like the prefix of the names
+        of values.
         """
 
     def finish(self) -> None:
@@ -62,12 +65,12 @@ class TrackerRun(Protocol):
 
 
 class TrackerFeed:
-    """Logs to the trackers on a separate thread, as a tracker may wait for a network. It is a
-    context manager around a run.
+    """Logs to the trackers on a separate thread, since a tracker may wait for a network. Use it as
+    a context manager around a run.
 
-    If a tracker fails, a warning is logged and it is not used again in this run; the results are
-    unaffected. The database records which values were logged, so that a resumed run logs only new
-    ones.
+    If a tracker fails, a warning is logged and the tracker is not used again in this run; the
+    results are unaffected. The database records the values that were logged, so that a resumed run
+    logs only new values.
     """
 
     def __init__(self, plan: ResolvedPlan) -> None:
@@ -82,7 +85,9 @@ class TrackerFeed:
         )
 
     def update(self) -> None:
-        """Request a check for complete cases. Calls while trackers are busy count as one."""
+        """Request a check for complete cases. Several calls while trackers are busy cause only one
+        check.
+        """
         self._updated.set()
 
     def __enter__(self) -> TrackerFeed:
@@ -97,7 +102,7 @@ class TrackerFeed:
             self._thread.join(CLOSE_S)
             if self._thread.is_alive():
                 log.warning(
-                    "%s: still sending after %g s; the rest is dropped",
+                    "%s: still sending after %g s; the remaining values are dropped",
                     ", ".join(self._working),
                     CLOSE_S,
                 )
@@ -107,7 +112,7 @@ class TrackerFeed:
         while not over:
             self._updated.wait()
             self._updated.clear()
-            # The flag is read before the results, so that all complete cases are logged.
+            # Read the flag before the results, so that all complete cases are logged.
             over = self._closing
             for tracker in list(self._working):
                 try:
@@ -127,7 +132,7 @@ class TrackerFeed:
                 log.warning("%s: %s: %s", name, type(error).__name__, error)
 
     def _log_to(self, name: str, results: Results) -> None:
-        """Log the complete cases, and then the complete policies, except those whose values the
+        """Log the complete cases, and then the complete policies, except for values that the
         tracker already has.
         """
         summary = summarize(results)
@@ -168,7 +173,7 @@ class TrackerFeed:
         return run
 
     def _videos(self, case: CaseResults) -> list[Path]:
-        """Return the videos of a case that are logged, failures first."""
+        """Return the videos of a case to log, failures first."""
         ordered = sorted(case.episodes, key=lambda episode: bool(episode.result.success_once))
         videos = []
         for episode in ordered:
@@ -198,7 +203,7 @@ def _is_complete(case: CaseResults) -> bool:
 
 
 def _metrics(label: str, group: Group) -> dict[str, float]:
-    """Return the values of a group that are known, by the names of their curves."""
+    """Return the known values of a group, by the names of their curves."""
     values = {
         "success_once": group.success_once.rate,
         "success_at_end": group.success_at_end.rate,

@@ -514,7 +514,7 @@ def test_results_can_be_told_before_the_end_which_the_log_says(tmp_path: Path) -
     assert "unblinded" in json.loads(
         (tmp_path / "out" / "trials.jsonl").read_text().splitlines()[-1]
     )
-    with pytest.raises(ConfigError, match="expected a log that this key opens"):
+    with pytest.raises(ConfigError, match="expected a log of this key"):
         unblind(tmp_path / "out", "another key")
     with pytest.raises(ConfigError, match="expected the folder of an evaluation on a robot"):
         unblind(tmp_path)

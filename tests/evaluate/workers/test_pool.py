@@ -76,7 +76,7 @@ def test_workers_play_on_while_there_is_no_room_for_all(
         wait_for(
             lambda: (
                 reports.extend(short.wait(0.1))
-                or "going on with 1 of 2 workers: expected" in caplog.text
+                or "continuing with 1 of 2 workers: expected" in caplog.text
             )
         )
         assert short._workers == [waiting, playing]
@@ -169,10 +169,10 @@ def test_that_it_goes_on_with_fewer_is_said_once_until_another_comes_up(
     capacity.note_playing()
     for _ in range(3):
         capacity.report_shortage(WANTED, running=2)
-    assert caplog.text.count("going on with 2 of 3 workers: expected {") == 1
+    assert caplog.text.count("continuing with 2 of 3 workers: expected {") == 1
     capacity.note_started()
     capacity.report_shortage(WANTED, running=2)
-    assert caplog.text.count("going on with") == 2
+    assert caplog.text.count("continuing with") == 2
 
 
 def test_between_two_episodes_nobody_gives_up_but_where_nothing_is_played_for_as_long(

@@ -1,7 +1,7 @@
-"""Geometry of the page's charts, in SVG's units; `templates/charts.html.j2` draws them.
+"""Geometry of the page's charts, in SVG units; `templates/charts.html.j2` draws the charts.
 
-Colours are the classes c0 to c5 of the stylesheet, which has them for light, dark and print. Lines
-also differ in their dashes, for readers who cannot distinguish the colours.
+Colours are the classes c0 to c5 of the stylesheet, which defines them for light mode, dark mode and
+print. Lines also differ in their dashes, for readers who cannot distinguish the colours.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ NONE, MINUS = "\u2013", "\u2212"
 _COLOURS = 6
 _DASHES = (None, "7 3", "2 3", "9 3 2 3", "12 4", "4 4")
 _GLYPH = 96  # the width of a glyph
-_EDGE = 6  # the margin beyond the ends of a glyph's axis, so that a dot at an end fits
-_LIMITS = (0.05, 0.1, 0.2, 0.4, 0.6, 1.0)  # the largest differences of the axes
+_EDGE = 6  # the margin at both ends of a glyph's axis, so that a dot at an end fits
+_LIMITS = (0.05, 0.1, 0.2, 0.4, 0.6, 1.0)  # possible ends of the axes of differences
 
 
 def percent(rate: Rate) -> str:
-    """Return the rate in per cent, with one decimal."""
+    """Return the rate in percent, with one decimal."""
     return NONE if rate.rate is None else f"{100 * rate.rate:.1f}"
 
 
 def interval(rate: Rate) -> str:
-    """Return the interval of the rate, in per cent."""
+    """Return the interval of the rate in percent."""
     if rate.rate is None:
         return NONE
     low, high = rate.interval
@@ -36,7 +36,7 @@ def interval(rate: Rate) -> str:
 
 
 def bounds(values: tuple[float, float] | None) -> str:
-    """Return (low, high) in per cent."""
+    """Return the interval (low, high) in percent."""
     if values is None:
         return NONE
     low, high = values
@@ -105,7 +105,7 @@ class PlotArea(NamedTuple):
     bottom: int = 240
 
     def y(self, share: float) -> float:
-        """Return the height at which `share`, in [0, 1], is drawn."""
+        """Return the y coordinate at which `share`, in [0, 1], is drawn."""
         return self.top + (self.bottom - self.top) * (1 - share)
 
 
@@ -118,7 +118,7 @@ class Series:
 
     name: str
     points: Sequence[tuple[float, Rate]]
-    level: bool = False  # whether it is a single rate, which does not depend on x
+    level: bool = False  # whether the series is a single rate, independent of x
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,14 +135,14 @@ class Curve:
     """A series as it is drawn."""
 
     style: Style
-    path: str | None  # None: no rate is known
+    path: str | None  # the path of the line; None: no rate is known
     band: str | None  # the path around its intervals
     dots: list[tuple[float, float, str]]  # (x, y, description)
 
 
 @dataclass(frozen=True, slots=True)
 class RateChart:
-    """Rates in per cent over x, each with its band."""
+    """A chart of rates in percent against x, each with the band of its intervals."""
 
     title: str
     x_label: str
@@ -152,8 +152,8 @@ class RateChart:
 
 @dataclass(frozen=True, slots=True)
 class BarChart:
-    """Bars that consist of segments, all on one scale. A bar is (name, sum of its values, [(style,
-    value, width in per cent)]).
+    """A chart of bars that consist of segments, all on one scale. A bar is (name, sum of its
+    values, [(style, value, width in percent)]).
     """
 
     title: str
@@ -163,8 +163,8 @@ class BarChart:
 
 @dataclass(frozen=True, slots=True)
 class Glyph:
-    """A dot with its interval on an axis, for the cell of a table. It is decoration, as the next
-    cells have the numbers.
+    """A dot with its interval on an axis, for the cell of a table. It is only decoration, since the
+    next cells contain the numbers.
     """
 
     axis: str
@@ -174,8 +174,8 @@ class Glyph:
 
 
 def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
-    """Return a chart with a line for each of `series`, in their order, on a common axis from the
-    smallest x to the largest.
+    """Return a chart with a line for each of `series`, in order, on a common axis from the smallest
+    to the largest x.
     """
     all_x: list[float] = []
     for line in series:
@@ -213,8 +213,8 @@ def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
 
 
 def bar_chart(rows: Mapping[str, Mapping[str, float]], title: str) -> BarChart:
-    """Return a chart with a bar for each of `rows`, of which there is at least one. A row maps the
-    names of its segments to their values.
+    """Return a chart with a bar for each of `rows`, which must not be empty. A row maps the names
+    of its segments to values.
     """
     names: dict[str, None] = {}  # names of all segments
     for values in rows.values():
@@ -246,8 +246,8 @@ def interval_glyph(rate: Rate) -> Glyph:
 
 
 def difference_limit(intervals: Iterable[tuple[float, float]]) -> float:
-    """Return the largest difference on the common axis of these intervals. The axis is symmetric
-    around 0.
+    """Return the end of an axis on which all these intervals fit. The axis is symmetric around
+    0.
     """
     largest = max((max(abs(low), abs(high)) for low, high in intervals), default=1.0)
     return next(limit for limit in _LIMITS if limit >= largest)
@@ -277,14 +277,14 @@ def difference_labels(limit: float) -> tuple[str, str, str]:
 
 
 def ticks(low: float, high: float, intervals: int = 6) -> list[float]:
-    """Return round numbers within [low, high] at equal distances, which divide it into at most the
-    given number of `intervals`.
+    """Return round numbers within [low, high] at equal distances, which divide the range into at
+    most `intervals` intervals.
     """
     if high <= low:
         return [low]
     shortest = (high - low) / intervals
     magnitude = 10 ** math.floor(math.log10(shortest))
-    # The tolerances keep ticks at the ends that rounding errors would remove.
+    # The tolerances keep the ticks at the ends, which rounding errors could remove.
     distances = (factor * magnitude for factor in (1, 2, 2.5, 5, 10))
     distance = next(value for value in distances if value >= shortest * (1 - 1e-9))
     first = math.ceil(low / distance - 1e-9)
@@ -293,7 +293,7 @@ def ticks(low: float, high: float, intervals: int = 6) -> list[float]:
 
 
 def short(value: float) -> str:
-    """Return a number for an axis: 20000 -> "20k"."""
+    """Return a number in the short form for an axis: 20000 -> "20k"."""
     for size, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:g}{suffix}"

@@ -1,4 +1,6 @@
-"""The sections about episodes: a table of all, videos of solved and unsolved ones, and errors."""
+"""The sections of the page about episodes: a table of all episodes, videos of solved and unsolved
+episodes, and errors.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,13 @@ from vlagents_ray.evaluate.results.summary import errors_of_policies
 from vlagents_ray.images.jpeg_png import data_url, encode_jpeg
 from vlagents_ray.registry import require
 
-BUDGET = 24 * 2**20  # most bytes of all videos that a page embeds
-POSTER = 224  # longest side of a poster, pixels
-SMALL = 128  # a video whose sides are shorter, in pixels, is enlarged without blurring
-MOST_UNSOLVED, MOST_SOLVED = 24, 12  # most videos of unsolved and of solved episodes
-MOST_LISTED = 20_000  # most episodes in the table
-AT_ONCE = 500  # rows that are visible when the page opens; its script shows more
+BUDGET = 24 * 2**20  # maximum total size of the videos that a page embeds, bytes
+POSTER = 224  # maximum side length of a poster, pixels
+SMALL = 128  # a video with shorter sides, in pixels, is enlarged without blurring
+MOST_UNSOLVED, MOST_SOLVED = 24, 12  # maximum number of videos of unsolved and of solved episodes
+MOST_LISTED = 20_000  # maximum number of episodes in the table
+# Number of rows that are visible when the page opens; the page's script shows more rows.
+AT_ONCE = 500
 MOST_ERRORS = 500
 MOST_LOGS = 50
 _OUTCOMES = {
@@ -43,7 +46,7 @@ class Player:
 
     label: str
     source: str | None  # the URL of the video
-    still: str | None  # the URL of its last frame; None if the file cannot be decoded
+    still: str | None  # the URL of the last frame; None if the file cannot be decoded
     style: str | None  # a class of the stylesheet
     tall: float | None  # height / width
 
@@ -80,7 +83,7 @@ class Failures:
     cards: list[Card]
     inlined: int  # number of videos that the page embeds
     linked: int  # number of videos that the page links to
-    outside: int  # number of videos that are omitted, as they are links out of the folder
+    outside: int  # number of videos that are omitted because they are links out of the folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +93,8 @@ class Errors:
     of_policies: list[tuple[tuple[str, str, str], int]]  # ((policy id, task, error), episodes)
     # The first `MOST_LOGS` attempts that failed because of infrastructure.
     attempts: list[tuple[CaseResults, Attempt]]
-    failed: int  # number of attempts that failed
-    repeated: int  # number of attempts that were repeated
+    failed: int  # number of failed attempts
+    repeated: int  # number of repeated attempts
     lost: int  # number of episodes without a result
 
 
@@ -103,18 +106,18 @@ class Gallery:
         self._budget = budget if inline else 0
         self.inlined = 0
         self.linked = 0
-        # Paths that are symbolic links out of their folder of results, and therefore not shown.
+        # Paths that are symbolic links out of the folder of results, and are therefore not shown.
         self.outside: set[str] = set()
 
     def cards(self, episodes: Sequence[CaseEpisode], limit: int) -> list[Card]:
-        """Return at most `limit` of these episodes that have a video, sampled in turn from the
-        tasks and policies.
+        """Return at most `limit` of these episodes, chosen in turn from the tasks and policies,
+        among the episodes with a video.
         """
         by_case: dict[str, list[CaseEpisode]] = {}
         for case, episode in episodes:
             if episode.videos:
                 by_case.setdefault(case.case_id, []).append((case, episode))
-        rounds = itertools.zip_longest(*by_case.values())  # one episode of each case, or None
+        rounds = itertools.zip_longest(*by_case.values())  # one episode from each case, or None
 
         cards: list[Card] = []
         for case, episode in filter(None, itertools.chain.from_iterable(rounds)):
@@ -127,7 +130,9 @@ class Gallery:
         return cards
 
     def player(self, video: str, label: str) -> Player | None:
-        """Return a player for `video`, a path of an episode; None if the file is missing."""
+        """Return a player for the video at the path `video` of an episode; None if the file is
+        missing.
+        """
         path = self._file(video)
         if path is None:
             return None
@@ -149,7 +154,7 @@ class Gallery:
         return Player(label, source, poster(frame), style, height / width)
 
     def link(self, video: str) -> str | None:
-        """Return the page's link to the file; None if there is no such file."""
+        """Return the page's link to a file; None if the file does not exist."""
         path = self._file(video)
         if path is None:
             return None
@@ -166,7 +171,7 @@ class Gallery:
 
 
 def episodes(results: Results, gallery: Gallery) -> Episodes | None:
-    """Return all episodes; None if there are none."""
+    """Return the view of all episodes; None if there are no episodes."""
     order = {name: index for index, name in enumerate(results.policy_ids)}
     cases = sorted(results.cases, key=lambda case: order[case.policy_id])
     played: list[CaseEpisode] = []
@@ -198,7 +203,7 @@ def _row(case: CaseResults, episode: Episode, gallery: Gallery) -> EpisodeRow:
 
 
 def failures(results: Results, gallery: Gallery) -> Failures | None:
-    """Return the episodes that were not solved; None if there are none."""
+    """Return the view of the unsolved episodes; None if all were solved."""
     unsolved: list[CaseEpisode] = []
     for case in results.cases:
         for episode in case.episodes:
@@ -211,7 +216,7 @@ def failures(results: Results, gallery: Gallery) -> Failures | None:
 
 
 def errors(results: Results) -> Errors | None:
-    """Return the errors with their logs; None if there are none."""
+    """Return the view of the errors and their logs; None if there are no errors."""
     of_policies = errors_of_policies(results)
     attempts: list[tuple[CaseResults, Attempt]] = []
     for case in results.cases:
@@ -235,7 +240,7 @@ def last_frame(video: Path) -> np.ndarray | None:
     try:
         with av.open(str(video)) as container:
             frames = collections.deque(container.decode(video=0), maxlen=1)
-    except (OSError, ValueError):  # PyAV's errors for broken files derive from these
+    except (OSError, ValueError):  # base classes of PyAV's errors for broken files
         return None
     return np.asarray(frames[0].to_ndarray(format="rgb24")) if frames else None
 

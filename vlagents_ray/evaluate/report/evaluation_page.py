@@ -1,5 +1,5 @@
-"""The interface of a page that shows an evaluation while it runs, which a plug-in registers in
-`vlagents_ray.pages`.
+"""The interface of a web page that shows an evaluation while it runs; a plug-in registers the page
+in `vlagents_ray.pages`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class EvaluationPage(ABC):
-    """A page that shows an evaluation while it runs."""
+    """A web page that shows an evaluation while it runs."""
 
     @abstractmethod
     def serve(
@@ -29,11 +29,12 @@ class EvaluationPage(ABC):
 
         Args:
             document: The progress and the results.
-            apps: The applications in this process's cluster whose sessions are shown.
-            address: Host and port to listen on; port 0 selects a free one.
-            keys: The accepted keys; None admits all clients, which only loopback allows.
+            apps: The applications in this process's cluster whose sessions the page shows.
+            address: The host and port to listen on; port 0 selects a free port.
+            keys: The accepted keys; None admits all clients, and is allowed only on a loopback
+                address.
 
         Raises:
-            ConfigError: Other machines would reach the page without a key, or the address is in
+            ConfigError: Other machines could reach the page without a key, or the address is in
                 use.
         """

@@ -1,9 +1,9 @@
 """`report.html`: an evaluation as one self-contained page.
 
-Python computes the content: this module, `success` and `episodes`, with the geometry of `charts`.
-`templates/page.html.j2` is the page. `sections.html.j2` has a macro for each of its sections, and
-`elements.html.j2` and `charts.html.j2` have the elements that sections share. The contents of
-`report.css` and `report.js` are embedded in the page.
+This module, `success` and `episodes` compute the content, and `charts` the geometry of the charts.
+`templates/page.html.j2` is the template of the page. `sections.html.j2` has a macro for each
+section, and `elements.html.j2` and `charts.html.j2` contain the elements that sections share. The
+contents of `report.css` and `report.js` are embedded in the page.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from vlagents_ray.evaluate.results.statistics import median
 from vlagents_ray.evaluate.results.summary import Summary, pushed_of, reported, summarize
 
 FILE = "report.html"
-STAGES = {  # the stages in `act.info["timing"]`, in their order, and their names on the page
+STAGES = {  # Stages in `act.info["timing"]`, in order -> their names on the page.
     "decode_ms": "decode",
     "queue_ms": "queue",
     "inference_ms": "inference",
@@ -61,7 +61,7 @@ MOST_BARS = 12
 
 
 class Figure(NamedTuple):
-    """A number of the page's head."""
+    """A number in the header of the page."""
 
     value: str
     name: str
@@ -73,27 +73,27 @@ class Section(NamedTuple):
 
     title: str
     macro: str  # the name of a macro of sections.html.j2
-    view: Any  # the argument of the macro; if it is None or empty, the section is left out
+    view: Any  # the argument of the macro; without it, or if it is empty, the section is left out
 
     @property
     def anchor(self) -> str:
-        """The id of its heading."""
+        """The id of the section's heading."""
         return self.title.lower().replace(" ", "-")
 
 
 def write_report(
     results: Results, path: Path, *, inline: bool = False, accept_changes: bool = False
 ) -> Path:
-    """Write the report of one folder, or of several (`combined`), to an HTML file. A file that
-    cannot be written completely is not written at all.
+    """Write the report of one folder, or of several (`combined`), to an HTML file. If the file
+    cannot be written completely, no file is written.
 
     Args:
         results: The results.
         path: The file. Missing folders are made.
-        inline: Whether the page embeds the videos, up to `episodes.BUDGET` bytes. It links to the
-            other videos, relative to `path`.
-        accept_changes: Compare policies even if something changed between them (`compare`); the
-            page shows these changes.
+        inline: Whether the page embeds videos, up to `episodes.BUDGET` bytes. It links to all other
+            videos, relative to `path`.
+        accept_changes: Compare policies even if files, settings or weights changed between them
+            (see `compare`); the page shows these changes.
 
     Returns:
         `path`.
@@ -146,11 +146,12 @@ def report(summary: Summary, gallery: Gallery, *, accept_changes: bool = False) 
 
 
 def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
-    """Return the headline of a comparison of two policy ids, which is their difference; None for
-    any other report.
+    """Return the headline of a comparison of two policy ids, which is the difference of their
+    rates; None for any other report.
 
-    The rate of the better policy would be biased upwards, as the policy is chosen by its rate. The
-    intervals of differences are not valid for cases that may stop early.
+    The headline is not the rate of the better policy, which would be biased upwards because the
+    policy is selected by its rate. Cases that may stop early have no headline, since the intervals
+    of their differences are not valid.
     """
     may_stop = any(group.success_once.error_rate is not None for group in summary.cases)
     if compared is None or may_stop:
@@ -174,8 +175,8 @@ def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
 def _solved(summary: Summary) -> Figure:
     """Return the headline without a comparison.
 
-    It is a success rate if the cases have a common one, otherwise the range of their rates. If
-    there are synchronous episodes, it is about them.
+    The headline is a success rate if the cases have a common rate, otherwise the range of their
+    rates. If there are synchronous episodes, only these count.
     """
     best = summary.best[0]
     timing, group = next(iter(summary.parts(best).items()))
@@ -236,7 +237,8 @@ def _templates() -> Environment:
         difference_labels=charts.difference_labels,
     )
 
-    # These two files are not escaped, as they are part of the package and contain no foreign text.
+    # These two files are not escaped, since they are part of the package and contain no text from
+    # elsewhere.
     folder = files(__package__ or "")
     for suffix in ("css", "js"):
         text = (folder / f"report.{suffix}").read_text("utf-8")
@@ -250,17 +252,18 @@ def _json(value: Any) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """The times of the stages of an answer for each policy, and of the env. Each is the median of
-    the episodes' medians.
+    """The durations of the stages of an answer for each policy, and of the env. Each duration is
+    the median of the episodes' medians.
     """
 
-    chart: BarChart | None  # None: no server reported its stages
-    stages: list[str]  # the stages that any policy reported
+    chart: BarChart | None  # the chart; None: no server reported the stages
+    stages: list[str]  # the stages that at least one policy reported
     # (policy id, ms, the env's reset in ms, answers)
     rows: list[tuple[str, list[float | None], float | None, int]]
     transports: list[str]
-    timed: int  # number of policy ids with stages; the chart shows the first `MOST_BARS`
-    # (policy id, task, figures) by case; None where the environment waits for the policy
+    timed: int  # number of policy ids with stages; the chart shows the first `MOST_BARS` of them
+    # (policy id, task, figures) for each case; the figures are None if the environment waits for
+    # the policy
     in_time: list[tuple[str, str, TimeShare | None]]
 
 
@@ -274,7 +277,7 @@ def latency(summary: Summary) -> Latency | None:
     if not counted:
         return None
 
-    stage_ms: dict[str, dict[str, float]] = {}  # the times of the stages of each policy id
+    stage_ms: dict[str, dict[str, float]] = {}  # durations of the stages of each policy id
     for name, results in counted.items():
         stage_ms[name] = {}
         for key, stage in STAGES.items():
@@ -308,41 +311,45 @@ _SETTINGS = ("env_options", "reset_options", "clock")
 
 @dataclass(frozen=True, slots=True)
 class Env:
-    """Envs with equal descriptions, and their contract."""
+    """Envs with equal descriptions and contracts."""
 
     tasks: list[str]
     constants: Mapping[str, Any] | None  # the constants of the benchmark's protocol
     described: Mapping[str, Any]
     settings: Mapping[str, Any]
-    contract: str | None  # as YAML
+    contract: str | None  # the contract as YAML
 
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """Runs, workers, versions, the metadata of each policy's server, and all settings."""
+    """Runs, workers, versions, the metadata of each policy's server, and all settings of the
+    evaluation.
+    """
 
     runs: tuple[Run, ...]
-    changes: list[Change]  # changes of files or weights, between episodes
+    changes: list[Change]  # changes of files or weights between episodes
     programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files by path)
-    # (policy id, checkpoint, commit, digest or version of its weights)
+    # (policy id, checkpoint, commit, digest or version of the weights)
     checkpoints: list[tuple[str, str]]
     workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)
-    versions: list[Mapping[str, Any]]  # versions of each folder
+    versions: list[Mapping[str, Any]]  # versions of packages for each folder
     policies: list[tuple[str, str]]  # (name, metadata as YAML)
     settings: list[tuple[str, str]]  # (folder, settings as YAML)
 
 
 @dataclass(frozen=True, slots=True)
 class Repeat:
-    """The arguments of the commands that repeat the evaluation and this page."""
+    """The arguments of the commands that repeat the evaluation and write this page again."""
 
-    # (settings as YAML, whether they lack a policy that Python code made)
+    # (settings as YAML, whether they lack a policy that Python code created)
     runs: list[tuple[str, bool]]
     folders: list[str]
 
 
 def protocol(results: Results) -> list[Env]:
-    """Return the description and contract of the envs; envs with the same ones are one entry."""
+    """Return the descriptions and contracts of the envs, with one entry for all envs whose
+    description and contract are equal.
+    """
     alike: dict[str, list[CaseResults]] = {}
     for case in results.cases:
         settings = {name: case.settings.get(name) for name in _SETTINGS}
@@ -364,7 +371,7 @@ def protocol(results: Results) -> list[Env]:
 
 
 def configuration(results: Results) -> Configuration:
-    """Return the software and the machines that made the results."""
+    """Return the software and the machines that produced the results."""
     programs: dict[str, Mapping[str, str]] = {}  # by env
     checkpoints: dict[tuple[str, str], None] = {}
     for case in results.cases:
@@ -387,7 +394,7 @@ def configuration(results: Results) -> Configuration:
         processes.setdefault(description, set()).add((worker.run, worker.pid))
 
     last_runs = _last_runs(results)
-    versions: list[Mapping[str, Any]] = []  # for each folder, the versions that are known
+    versions: list[Mapping[str, Any]] = []  # known versions for each folder
     for run in last_runs:
         versions.append({name: text for name, text in run.versions.items() if text is not None})
 
@@ -408,7 +415,7 @@ def configuration(results: Results) -> Configuration:
 def repeat(results: Results) -> Repeat:
     """Return the settings and the folders of the commands that repeat the evaluation.
 
-    The settings lack the addresses of policies that were served for the run.
+    The settings do not contain the addresses of policies that were served only for the run.
     """
     folders = list(dict.fromkeys(str(run.config.get("out")) for run in results.runs))
     runs = []
@@ -428,8 +435,8 @@ def repeat(results: Results) -> Repeat:
 
 
 def _last_runs(results: Results) -> list[Run]:
-    """Return the last run of each folder. Earlier runs had the same settings, except those on which
-    results do not depend.
+    """Return the last run of each folder. Earlier runs had the same settings, except for settings
+    that do not affect the results.
     """
     return list({run.config.get("out"): run for run in results.runs}.values())
 

@@ -26,39 +26,42 @@ from vlagents_ray.evaluate.results.reader import (
 from vlagents_ray.evaluate.results.statistics import Rate
 
 STARTING = "starting"
-_FAILURES = 24  # most failures in the document, the newest ones
-_TEXT = 300  # most characters of an error or an instruction
-_EVERY_S = 1.0  # shortest time between two readings of the results, s
-_SHARE = 0.04  # largest share of a core for reading the results
+_FAILURES = 24  # maximum number of failures in the document, which contains the newest
+_TEXT = 300  # maximum length of an error or an instruction, characters
+_EVERY_S = 1.0  # minimum time between two readings of the results, s
+_SHARE = 0.04  # maximum share of a core for reading the results
 WAITING, ENDED, STOPPED = "waiting", "ended", "stopped"
 
 
 class ResultsDocument:
-    """Describes the results of an evaluation or a training, which any process may be writing.
+    """Describes the results of an evaluation or a training, which may run in another process.
 
-    `read` and `video` are called on one thread. Numbers are computed from the folder by the
-    report's code, so they include earlier runs and, in a training, earlier versions. Results are
-    read only when `read` is called.
+    `read` and `video` must be called on one thread. The report's code computes the numbers from the
+    folder, so they include earlier runs and, in a training, earlier versions. Results are read only
+    when `read` is called.
     """
 
     reason = ""
     """The error that ended the evaluation."""
 
-    # Whether further evaluations follow, such as those of a training's checkpoints.
+    # Whether further evaluations follow, such as the evaluations of later checkpoints of a
+    # training.
     goes_on = False
 
     def __init__(self, out: Path) -> None:
-        """Describe the results in the folder `out`, which need not exist yet."""
+        """Create a document of the results in the folder `out`, which need not exist yet."""
         self._out = out
-        self._numbers: dict[str, int] = {}  # the number of each video by its path, in order
+        # Number of each video, by path, in the order of the numbers.
+        self._numbers: dict[str, int] = {}
         self._document: dict[str, Any] = {}
         self._read_at, self._took_s = float("-inf"), 0.0
 
     def read(self) -> dict[str, Any]:
-        """Return {"evaluation": the document}; the same object as before if nothing has changed.
+        """Return {"evaluation": the document}; this is the same object as before if the results
+        were not read again.
 
-        A call may take as long as reading the folder of results. On average, calls use at most 4 %
-        of a core.
+        A call may take the time of reading the folder of results, but on average calls use at most
+        4 % of a core.
         """
         age_s = time.monotonic() - self._read_at
         if self.is_due(rested=age_s >= max(_EVERY_S, self._took_s / _SHARE)):
@@ -69,8 +72,8 @@ class ResultsDocument:
         return self._document
 
     def video(self, number: int) -> Path | None:
-        """Return the file of a video in the document; None if there is no such file, or if it is a
-        link out of the folder.
+        """Return the file of a video in the document; None if the file does not exist, or is a link
+        out of the folder.
         """
         if not 0 <= number < len(self._numbers):
             return None
@@ -84,7 +87,7 @@ class ResultsDocument:
         """Return whether to read the results.
 
         Args:
-            rested: Whether reading them now would stay within the share of a core.
+            rested: Whether reading the results now keeps within the share of a core.
         """
         return rested
 
@@ -94,7 +97,7 @@ class ResultsDocument:
 
     def _describe(self) -> dict[str, Any]:
         results = None
-        with contextlib.suppress(ConfigError):  # raised while the file is being created
+        with contextlib.suppress(ConfigError):  # raised while another process creates the file
             results = Results.load(self._out) if (self._out / FILE).is_file() else None
         state = self.state(results)
         cases = () if results is None else results.cases
@@ -162,7 +165,8 @@ def _case(case: CaseResults) -> dict[str, Any]:
         "planned": _planned(case),
         "stopped": case.stopped_at is not None,
         "sequence": case.stop is not None,
-        # Share of the ticks at which the policy was to act; None if the environment waits for it.
+        # Share of the ticks in time, among the ticks that need an action of the policy; None if the
+        # environment waits for the policy.
         "share_in_time": None if time_share is None else time_share.share,
     } | _rate(rate_of([case], "success_once"))
 
@@ -187,8 +191,8 @@ def _done(case: CaseResults) -> int:
 
 
 def _planned(case: CaseResults) -> int:
-    """Return the number of planned episodes; for a case that stopped early, without those that are
-    no longer needed.
+    """Return the number of planned episodes, without episodes that are no longer needed because
+    their case stopped early.
     """
     return case.planned if case.stopped_at is None else _done(case)
 
@@ -209,7 +213,9 @@ def _rate(rate: Rate) -> dict[str, Any]:
 
 
 class ProgressDocument(ResultsDocument, Progress):
-    """Describes an evaluation as its `Progress`; the page's thread may read it concurrently."""
+    """Describes an evaluation to which it is connected as the `Progress`. The page's thread may
+    read it concurrently.
+    """
 
     def __init__(self, out: Path, shown: Progress | None = None, *, goes_on: bool = False) -> None:
         super().__init__(out)
@@ -235,7 +241,9 @@ class ProgressDocument(ResultsDocument, Progress):
         self._shown.stopped(case, at, spared)
 
     def end(self) -> None:
-        """Note that the evaluation has ended; the state is "waiting" if others follow."""
+        """Record that the evaluation has ended; the state is "waiting" if further evaluations
+        follow.
+        """
         if self.goes_on:
             self._change(WAITING)
         else:
@@ -243,17 +251,19 @@ class ProgressDocument(ResultsDocument, Progress):
         self._shown.end()
 
     def close(self) -> None:
-        """Note that no evaluation follows, so that the state is the state of the last run."""
+        """Record that no further evaluation follows; the state is then the state of the last
+        run.
+        """
         if self._state != STOPPED:
             self._change(ENDED)
 
     def fail(self, reason: str) -> None:
-        """Note that an error stopped the evaluation."""
+        """Record that an error stopped the evaluation."""
         self.reason = reason
         self._change(STOPPED)
 
     def is_due(self, *, rested: bool) -> bool:
-        """Return whether to read the results: if anything has changed, and immediately after the
+        """Return whether to read the results: after a change if `rested`, and always after the
         end.
         """
         is_final = self._changed and self._state in (ENDED, STOPPED)

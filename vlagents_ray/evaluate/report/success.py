@@ -1,4 +1,4 @@
-"""Success rates and their differences, as sections of the page."""
+"""The sections of the page with success rates and their differences."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from vlagents_ray.evaluate.results.reader import CaseResults, Results, by_timing
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate
 from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of, summarize
 
-MOST_PAIRS = 15  # most pairs that are shown unfolded: the pairs of six policy ids
-# Most pairs that are all compared: the pairs of 40 policy ids. Of more, such as those of a whole
-# training, only the main ones are compared.
+MOST_PAIRS = 15  # maximum number of pairs that are shown unfolded: all pairs of six policy ids
+# Maximum number of pairs that are all compared: all pairs of 40 policy ids. If there are more
+# pairs, e.g. for the checkpoints of a whole training, only the main pairs are compared.
 MOST_COMPARED = 780
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Rows of the table, one for each policy id."""
+    """A block of rows in the table, one row for each policy id."""
 
     name: str
     groups: list[Group]
-    is_sum: bool = False  # whether it is the sum of the tasks above it
+    is_sum: bool = False  # whether the block is the sum of the tasks above it
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +35,8 @@ class SuccessTable:
 
     blocks: list[Block]
     several: bool  # whether there are several policy ids
-    stopped: int | None  # number of cases that stopped early; None if none could
-    pooled: bool  # whether every policy has one rate for all its cases
+    stopped: int | None  # number of cases that stopped early; None if no case could stop early
+    pooled: bool  # whether every policy has a common rate for all its cases
     some_lost: bool  # whether episodes were lost to infrastructure
 
 
@@ -50,7 +50,7 @@ class LearningCurve:
 
 
 def success_table(summary: Summary) -> SuccessTable:
-    """Return the table of success rates, with the facts for the note below it."""
+    """Return the table of success rates, with the values for the note below the table."""
     total = summary.total
     return SuccessTable(
         list(_blocks(summary)),
@@ -62,23 +62,23 @@ def success_table(summary: Summary) -> SuccessTable:
 
 
 def learning_curves(summary: Summary) -> list[LearningCurve]:
-    """Return success rates against training steps for each policy with several steps; empty if no
-    policy has several.
+    """Return success rates against training steps, for each policy with several steps; empty if no
+    policy has several steps.
     """
     curves = [_learning_curve(title, cases) for title, cases in _parts_with_a_rate(summary)]
     return [curve for curve in curves if curve is not None]
 
 
 def _blocks(summary: Summary) -> Iterator[Block]:
-    """Yield a block for each task in the order of the plan, the sum of each suite after its tasks,
-    and finally the sum of all tasks.
+    """Yield a block for each task, in the order of the plan, a block with the sum of each suite
+    after its tasks, and finally a block with the sum of all tasks.
     """
     order = {name: number for number, name in enumerate(summary.results.policy_ids)}
 
     def in_order(groups: list[Group]) -> list[Group]:
         return sorted(groups, key=lambda group: order[group.policy_id])
 
-    suites: dict[str, dict[str, list[Group]]] = {}  # the groups of each env of each suite
+    suites: dict[str, dict[str, list[Group]]] = {}  # groups of cases by suite and env
     for group in summary.cases:
         suites.setdefault(group.suite, {}).setdefault(group.env, []).append(group)
 
@@ -95,7 +95,8 @@ def _blocks(summary: Summary) -> Iterator[Block]:
         is_one_suite = len({case.suite for case in cases}) == 1
         is_one_task = is_one_suite and len({case.env for case in cases}) == 1
         if is_one_task or (is_one_suite and len(suites) > 1):
-            continue  # this sum is already there, as the only task or the sum of its suite
+            # The sum would repeat the block of the only task, or the sum of the only suite.
+            continue
         name = "all" if len(timings) == 1 else f"all {timing}"
         yield Block(name, in_order(_by_policy_id(cases, TOTAL)), is_sum=True)
 
@@ -109,8 +110,8 @@ def _by_policy_id(cases: Sequence[CaseResults], suite: str) -> list[Group]:
 
 
 def _parts_with_a_rate(summary: Summary) -> Iterator[tuple[str, list[CaseResults]]]:
-    """Yield the title and the cases of each chart: all cases, then each suite, or each task of a
-    suite without a common rate.
+    """Yield the title and the cases of each chart: all cases, then the cases of each suite; for a
+    suite without a common rate, the cases of each task.
     """
     timings = by_timing(summary.results.cases)
     for timing, cases in timings.items():
@@ -135,7 +136,7 @@ def _parts_with_a_rate(summary: Summary) -> Iterator[tuple[str, list[CaseResults
 
 
 def _all_have_rates(cases: Sequence[CaseResults]) -> bool:
-    """Return whether each policy id has one rate over these cases."""
+    """Return whether each policy id has a common rate over these cases."""
     return all(group.success_once.pooled for group in _by_policy_id(cases, ""))
 
 
@@ -186,18 +187,18 @@ class Difference:
     b: str
     suite: str
     pairs: Pairs
-    interval: tuple[float, float]  # 95 %
+    interval: tuple[float, float]  # 95 % interval
     adjusted: float  # p-value
     decided: bool
 
 
 @dataclass(frozen=True, slots=True)
 class ComparisonPart:
-    """The comparisons of the episodes with one timing."""
+    """The comparisons of the episodes with the same timing."""
 
     timing: str
     shown: list[Difference]
-    by_suite: list[list[Difference]]  # the suites of each shown comparison that has several
+    by_suite: list[list[Difference]]  # lines by suite of each shown comparison with several suites
     folded: list[Difference]
 
 
@@ -206,29 +207,31 @@ class Comparisons:
     """The comparisons of all pairs of policy ids, the main pairs first."""
 
     parts: list[ComparisonPart]
-    left_out: int  # pairs besides the main ones that are not compared, if there are very many
+    left_out: int  # number of further pairs that are not compared, if there are very many pairs
     several_timings: bool
-    reasons: list[str]  # reasons why other pairs are not compared
+    reasons: list[str]  # reasons why some pairs cannot be compared
     changes: list[Change]  # accepted differences between environments of compared policies
 
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """The comparisons of the episodes with one timing. Their p-values are adjusted for the number
-    of comparisons.
+    """The comparisons of the episodes with the same timing; their p-values are adjusted for the
+    number of comparisons.
     """
 
     timing: str
-    comparisons: list[Comparison]  # the main ones first
-    main: int  # number of the main ones
-    # Pairs besides the main ones that are not compared, if there are very many. The adjustment
-    # includes their number.
+    comparisons: list[Comparison]  # comparisons; those of the main pairs are first
+    main: int  # number of main pairs
+    # Number of further pairs that are not compared, if there are very many pairs. The adjustment of
+    # the p-values includes this number.
     left_out: int
     reasons: list[str]  # reasons why other pairs are not compared
 
 
 def families(summary: Summary, *, accept_changes: bool = False) -> list[Family]:
-    """Compare all policy ids, separately for each timing; of very many pairs only the main ones."""
+    """Compare all pairs of policy ids, separately for each timing; if there are very many pairs,
+    compare only the main pairs.
+    """
     members = []
     for timing, cases in by_timing(summary.results.cases).items():
         results = summary.results.among(cases)
@@ -238,8 +241,8 @@ def families(summary: Summary, *, accept_changes: bool = False) -> list[Family]:
         chosen_of = None
         if len(all_pairs) > MOST_COMPARED:
             candidates = _main_pairs(of_timing, all_pairs)
-            # Whether a pair is a main one depends on the rates, so the adjustment is for all pairs
-            # that could have been main ones.
+            # The main pairs are selected by the rates, so the adjustment must include all pairs
+            # that could have been selected.
             if len(candidates) < len(all_pairs):
                 chosen_of = len(all_pairs)
 
@@ -264,7 +267,7 @@ def families_json(summary: Summary, *, accept_changes: bool = False) -> list[dic
 
 
 def compare_all(summary: Summary, *, accept_changes: bool = False) -> Comparisons | None:
-    """Return all comparisons; None for a single policy id."""
+    """Return the view of all comparisons; None for a single policy id."""
     if len(summary.results.policy_ids) < 2:
         return None
     parts: list[ComparisonPart] = []
@@ -313,8 +316,8 @@ def _difference(comparison: Comparison, line: Line) -> Difference:
 
 
 def _main_pairs(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return the main pairs among `pairs`: each checkpoint with the one before it, and the best
-    policy id with the best one of each other policy.
+    """Return the main pairs among `pairs`: each checkpoint with the previous checkpoint, and the
+    best policy id with the best policy id of each other policy.
     """
     policies: dict[str, str] = {}  # by policy id
     steps: dict[str, int | None] = {}
@@ -323,7 +326,7 @@ def _main_pairs(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tupl
         steps[case.policy_id] = case.step
 
     main = []
-    # The checkpoints of a policy are in the order of their steps.
+    # The policy ids of a policy are in the order of their steps.
     for earlier, later in itertools.pairwise(summary.results.policy_ids):
         if policies[earlier] == policies[later] and steps[earlier] is not None:
             main.append((later, earlier))

@@ -1,5 +1,5 @@
-"""An evaluation on a terminal: its progress, live or in plain lines, and the table of results at
-its end.
+"""The output of an evaluation on a terminal: the progress, as a live table or in plain lines, and
+the table of results at the end.
 """
 
 from __future__ import annotations
@@ -32,35 +32,37 @@ from vlagents_ray.evaluate.results.summary import (
 )
 
 LINE_EVERY_S = 5.0
-MOST_ROWS = 12  # most rows in the table of a running evaluation
+MOST_ROWS = 12  # maximum number of rows in the table of a running evaluation
 
 
 class Progress:
     """The callbacks of a running evaluation, which are called on one thread.
 
-    The methods of this class do nothing; derived classes override some. Those of `progress_for`
-    show the progress, live on a terminal and in plain lines elsewhere.
+    The methods of this class do nothing; derived classes override some of them. The objects that
+    `progress_for` returns show the progress, as a live table on a terminal and in plain lines
+    elsewhere.
     """
 
     def begin(self, cases: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
-        """Note that the evaluation begins.
+        """Called when the evaluation begins.
 
         Args:
             cases: All planned cases.
             recorded: The success rates of earlier runs, by the case's fingerprint.
-            left: The number of episodes to be run.
+            left: The number of episodes to run.
         """
 
     def episode(self, case: EvalCase, result: EpisodeResult) -> None:
-        """Note that an episode was recorded.
+        """Called when an episode was recorded.
 
         Args:
-            case: The case that it belongs to.
-            result: Its result.
+            case: The case of the episode.
+            result: The result of the episode.
         """
 
     def retry(self, job: Job, failure: Failure) -> None:
-        """Note that an attempt failed by infrastructure; the episode will be run again.
+        """Called when an attempt failed because of infrastructure; the episode will be run
+        again.
 
         Args:
             job: The episode.
@@ -68,20 +70,22 @@ class Progress:
         """
 
     def stopped(self, case: EvalCase, at: int, spared: int) -> None:
-        """Note that a case stopped early.
+        """Called when a case stopped early.
 
         Args:
             case: The case.
             at: The number of finished episodes.
-            spared: The number of episodes that will not be run.
+            spared: The number of planned episodes that will not be run.
         """
 
     def end(self) -> None:
-        """Note that the evaluation has ended; no call follows."""
+        """Called when the evaluation has ended; no other call follows."""
 
 
 class _CountedProgress(Progress):
-    """Keeps the counts of both displays, and prints errors and retries as lines."""
+    """The base class of both displays: maintains the counts, and prints errors and retries as
+    lines.
+    """
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -91,14 +95,15 @@ class _CountedProgress(Progress):
         """Start the counts from the rates of earlier runs."""
         self._started = monotonic()
         self._cases = {case.fingerprint: case for case in cases}
-        # The keys of these two are the cases' fingerprints.
+        # The keys of the next two dicts are the fingerprints of the cases.
         self._rates = {case_id: recorded.get(case_id, Rate(0, 0)) for case_id in self._cases}
         self._infra_failed = dict.fromkeys(self._cases, 0)
         self._steps = 0
-        self._played = 0  # episodes of this run
+        self._played = 0  # number of finished episodes of this run
         self._left = left
         self._retries = 0
-        self._causes: set[tuple[str, str]] = set()  # (policy id, cause) of errors that were shown
+        # (policy id, cause) of the errors that were already shown.
+        self._causes: set[tuple[str, str]] = set()
         self._is_one_policy = len({case.policy_id for case in cases}) == 1
 
     def episode(self, case: EvalCase, result: EpisodeResult) -> None:
@@ -114,7 +119,7 @@ class _CountedProgress(Progress):
         successes = before.successes + bool(result.success_once)
         episodes = before.episodes + 1
         bounds = None
-        if before.error_rate is not None:  # the case may stop early
+        if before.error_rate is not None:  # at most: the case may stop early
             bounds = confidence_sequence(successes, episodes, before.error_rate)
         self._rates[case.fingerprint] = Rate(successes, episodes, bounds, before.error_rate)
 
@@ -127,14 +132,14 @@ class _CountedProgress(Progress):
                 self._print(f"{where}, counted as no success: {error}")
 
     def retry(self, job: Job, failure: Failure) -> None:
-        """Print why an attempt failed."""
+        """Print the reason why an attempt failed."""
         self._retries += 1
         first_line = failure.message.strip().partition("\n")[0]
         attempt = f"{job.key.env} episode {job.key.episode}: attempt {job.attempt}"
         self._print(f"{attempt} failed, trying again: {first_line}")
 
     def stopped(self, case: EvalCase, at: int, spared: int) -> None:
-        """Print after how many episodes the case stopped."""
+        """Print the number of episodes after which a case stopped."""
         self._left -= spared
         name = " ".join(filter(None, case.name))
         self._print(f"{name}: certain enough, stopped after {at} of {case.planned} episodes")
@@ -146,7 +151,7 @@ class _CountedProgress(Progress):
 
     def _rows(self) -> list[tuple[str, str, str]]:
         """Return a row (name, "done/planned", success so far) for each case; if there are many
-        cases, only for those of which some but not all episodes have ended.
+        cases, only for the cases in progress, i.e. with some but not all episodes finished.
         """
         show_all = len(self._cases) <= MOST_ROWS
         rows: list[tuple[str, str, str]] = []
@@ -177,7 +182,7 @@ class _CountedProgress(Progress):
 
 
 class LiveProgress(_CountedProgress):
-    """Updates a table on a terminal, with errors and retries above it."""
+    """Updates a table on a terminal, and prints errors and retries above the table."""
 
     def __init__(self, console: Console) -> None:
         super().__init__(console)
@@ -190,7 +195,7 @@ class LiveProgress(_CountedProgress):
         self._live.start()
 
     def end(self) -> None:
-        self._live.stop()  # which leaves the last state on the terminal
+        self._live.stop()  # the last state of the table remains on the terminal
 
     def _drawing(self) -> Rows:
         table = Table("env", "episodes", "success so far", box=None)
@@ -228,8 +233,8 @@ def progress_for(console: Console) -> Progress:
 
 
 def seconds_left(episodes: int, played: int, elapsed_s: float) -> float | None:
-    """Estimate the time of `episodes` further episodes, s; None if no episode is left, or if none
-    has ended yet.
+    """Estimate the duration of `episodes` further episodes, s; None if no episode is left, or if no
+    episode has ended yet.
     """
     return episodes * elapsed_s / played if episodes > 0 and played else None
 
@@ -270,13 +275,14 @@ def results_table(summary: Summary) -> Table:
 
 
 def print_summary(console: Console, summary: Summary) -> None:
-    """Print the table of results, failures of infrastructure, and the paths of all files written.
+    """Print the table of results, failures of infrastructure, and the paths of all written
+    files.
 
     Args:
         console: The console.
         summary: The result of `evaluate`.
     """
-    # Imported late, as Jinja is needed only after the last episode.
+    # Import Jinja late, since it is needed only after the last episode.
     from vlagents_ray.evaluate.report.page import FILE
 
     console.print(results_table(summary))
@@ -367,20 +373,20 @@ def _early_stops(summary: Summary) -> list[str]:
             )
     if not summary.has_one_rate_each:
         lines.append(
-            "cases that stopped after different numbers of episodes have no common rate: quote "
-            "each separately"
+            "cases that stopped after different numbers of episodes have no common rate: report "
+            "each rate separately"
         )
     return lines
 
 
 def _clock_gaps(summary: Summary) -> list[str]:
-    """Return a line for each gap of the report, on the episodes of both clocks."""
+    """Return a line for each gap between real-time and synchronous success rates in the report."""
     lines = []
     for gap in clock_gaps(summary.results):
         counted: list[EpisodeResult] = []
         for case in gap.cases:
             counted += case.counted
-        # The number of steps is 0 if the policy failed before the first step of each episode.
+        # The number of steps is 0 if the policy failed before the first step of every episode.
         steps = max(1, sum(result.steps for result in counted))
         waited = sum(result.ticks_waited for result in counted) / steps
         low, high = gap.total.interval
@@ -393,8 +399,8 @@ def _clock_gaps(summary: Summary) -> list[str]:
 
 
 def _times(summary: Summary) -> list[str]:
-    """Return a line for each case in real time, or on a robot: its ticks in time, and the ages of
-    its actions.
+    """Return a line for each case in real time or on a robot, with the share of ticks in time and
+    the ages of actions.
     """
     lines = []
     for group in summary.cases:

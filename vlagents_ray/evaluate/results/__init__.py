@@ -1,1 +1,3 @@
-"""The folder of results: written exactly once, read, merged, compared, summarised."""
+"""The folder of results: code that writes each episode exactly once, and that reads, merges,
+compares and summarises results.
+"""

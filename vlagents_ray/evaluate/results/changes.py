@@ -1,4 +1,6 @@
-"""Changes of the files, settings and weights of an evaluation's policies and environments."""
+"""Detection of changes in the files, settings and weights of an evaluation's policies and
+environments.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +10,20 @@ from typing import Any, NamedTuple
 
 from vlagents_ray.evaluate.plan.config import canonical, fingerprint
 
-IDENTITY = ("policy", "checkpoint", "weights")  # fields of a policy's metadata
-_OF_CHECKPOINT = {"checkpoint", "checkpoint_step"}  # settings that "checkpoint" already compares
+IDENTITY = ("policy", "checkpoint", "weights")  # names of fields in a policy's metadata
+# Settings that the field "checkpoint" already covers.
+_OF_CHECKPOINT = {"checkpoint", "checkpoint_step"}
 _SWEPT = "checkpoint: "  # prefix of the names of the files that belong to a step of a sweep
-_DIGITS = 12  # digits of a digest that are printed
+_DIGITS = 12  # number of digits of a digest that are printed
 MIX = (
-    "restore the old files, give a new folder (--out), or mix both and have the report say so "
-    "(--accept-changes)"
+    "restore the old files, choose a new folder (--out), or mix both, which the report will "
+    "mention (--accept-changes)"
 )
 
 
 class EnvStatement(NamedTuple):
-    """The description and the contract of an environment, as JSON values; empty if no worker has
-    made it.
+    """The description and the contract of an environment, as JSON values; both are empty if no
+    worker has created the environment.
     """
 
     description: Mapping[str, Any]  # `EvalEnv.describe()`, such as the simulator's version
@@ -33,17 +36,19 @@ class Change:
 
     subject: str  # "env my_envs:Reach", "policy pi0", or "plan"
     name: str  # the name of the file or the setting
-    was: str | None  # the earlier digest or value; None if there was none
-    now: str | None  # the present digest or value
+    was: str | None  # the earlier digest or value; None if there was no value
+    now: str | None  # the present digest or value; None if there is no value
 
     def is_statement_of(self, env: str) -> bool:
-        """Return whether the description or the contract of this env changed (`env_changes`)."""
+        """Return whether this is a change of the description or the contract of the env (see
+        `env_changes`).
+        """
         prefixes = tuple(f"its {field} " for field in EnvStatement._fields)
         return self.subject == f"env {env}" and self.name.startswith(prefixes)
 
     def is_setting_of(self, policy: str) -> bool:
-        """Return whether the settings of this policy or of its wrappers changed
-        (`policy_changes`).
+        """Return whether this is a change of the settings of the policy or its wrappers (see
+        `policy_changes`).
         """
         return self.subject == f"policy {policy}" and self.name.startswith("its ")
 
@@ -52,14 +57,16 @@ class Change:
 
 
 def listed(changes: Sequence[Change]) -> str:
-    """Return the text of an error, with a line for each change."""
+    """Return the list of changes for an error message, one line for each change."""
     return "\n".join(f"- {change}" for change in changes)
 
 
 def program_changes(
     subject: str, was: Mapping[str, str] | None, now: Mapping[str, str] | None
 ) -> list[Change]:
-    """Compare two programs by file; no changes are known if one of them is None."""
+    """Return the changes between the files of two programs; empty if one of the programs is
+    None.
+    """
     if was is None or now is None:
         return []
     names = sorted(name for name in was.keys() | now.keys() if was.get(name) != now.get(name))
@@ -67,7 +74,9 @@ def program_changes(
 
 
 def env_changes(env: str, was: EnvStatement, now: EnvStatement) -> list[Change]:
-    """Compare the descriptions and the contracts of an environment, except empty ones."""
+    """Return the changes between two descriptions and contracts of an environment; empty values are
+    not compared.
+    """
     changes: list[Change] = []
     for field in EnvStatement._fields:
         before, after = getattr(was, field), getattr(now, field)
@@ -79,7 +88,7 @@ def env_changes(env: str, was: EnvStatement, now: EnvStatement) -> list[Change]:
 def _changed_values(
     subject: str, of: str, before: Mapping[str, Any], after: Mapping[str, Any]
 ) -> list[Change]:
-    """Compare two mappings by name. The name of a change is "`of` 'NAME'"."""
+    """Return the changes between two mappings. The name of a change is "`of` 'NAME'"."""
     changes = []
     for name in sorted(before.keys() | after.keys()):
         was, now = before.get(name), after.get(name)
@@ -89,11 +98,11 @@ def _changed_values(
 
 
 def changed(was: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> str | None:
-    """Return the field of a policy's identity that differs between two metadata of its server;
-    None if none differs.
+    """Return the field of a policy's identity that differs between two metadata of its server; None
+    if no field differs.
 
-    In a sweep (`swept`), sessions choose their checkpoint, so the server's checkpoint is not
-    compared.
+    In a sweep (`swept`), each session chooses a checkpoint, so the server's default checkpoint is
+    not compared.
     """
     for field in IDENTITY[: 1 if swept else 2]:
         if was.get(field) != now.get(field):
@@ -108,8 +117,8 @@ def changed(was: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> s
 def policy_changes(
     subject: str, was: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool
 ) -> list[Change]:
-    """Compare the files, settings and weights in two metadata of a policy's server. A change of the
-    weights is the last one.
+    """Return the changes of files, settings and weights between two metadata of a policy's server.
+    A change of the weights is the last entry.
     """
     changes = program_changes(
         subject, policy_program(was, swept=swept), policy_program(now, swept=swept)
@@ -124,7 +133,9 @@ def policy_changes(
 
 
 def _settings_changes(subject: str, was: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
-    """Compare the settings of a policy and its wrappers, such as those in a deployment file."""
+    """Return the changes between the settings of a policy and its wrappers, as in a deployment
+    file.
+    """
     changes: list[Change] = []
     before, after = was.get("config"), now.get("config")
     if before is not None and after is not None:
@@ -139,11 +150,11 @@ def _settings_changes(subject: str, was: Mapping[str, Any], now: Mapping[str, An
 
 
 def with_known(now: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return metadata of a policy, with the program, settings and weights that only another server
-    of the policy reports.
+    """Return the metadata `now` of a policy, completed with the program, settings and weights that
+    only another server of the policy reports.
 
-    A third server is then compared with everything that is known. Otherwise a server that reports
-    nothing, between two that differ, would hide their difference.
+    A third server can then be compared with all known values. Otherwise, a server that reports
+    nothing would hide a difference between the servers before and after it.
     """
     known = dict(now)
     for name in ("program", "config", "wrappers"):
@@ -155,8 +166,8 @@ def with_known(now: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, An
 
 
 def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str] | None:
-    """Return the digests of a policy's files by name; None if its server reports none. In a sweep,
-    the files of its checkpoint are left out.
+    """Return the digests of a policy's files by name; None if the server reports no files. In a
+    sweep, the files of the checkpoint are left out.
     """
     program = metadata.get("program")
     if program is None:
@@ -167,7 +178,7 @@ def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str
 
 
 def program_id(program: Mapping[str, str] | None) -> str | None:
-    """Return 16 digits that identify a program; None for one without files."""
+    """Return 16 digits that identify a program; None for a program without files."""
     return fingerprint(dict(program)) if program else None
 
 

@@ -1,4 +1,4 @@
-"""Results of several folders, combined for a report that compares them."""
+"""Combination of the results of several folders, for a report that compares them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vlagents_ray.evaluate.results.summary import reported
 
 
 def require_distinct(folders: Iterable[Path]) -> None:
-    """Raise `ConfigError` if one folder is named twice, possibly by other paths."""
+    """Raise `ConfigError` if a folder is given twice, possibly with different paths."""
     paths: dict[Path, Path] = {}
     for folder in folders:
         first = paths.setdefault(folder.resolve(), folder)
@@ -28,12 +28,12 @@ def require_distinct(folders: Iterable[Path]) -> None:
 def combined(folders: Sequence[Results]) -> Results:
     """Combine the results of several folders.
 
-    The folder's name is appended to a policy's name, as in "pi0 (second)", if two folders have the
-    policy in the same env, or with different files, or with different weights of the same
+    The folder's name is appended to a policy's name, as in "pi0 (second)", if two folders contain
+    the policy in the same env, or with different files, or with different weights of the same
     checkpoint.
 
     Raises:
-        ConfigError: There is no folder, or two of them are parts of one evaluation, which must be
+        ConfigError: No folder is given, or two folders are parts of one evaluation, which must be
             merged instead.
     """
     if not folders:
@@ -49,7 +49,7 @@ def combined(folders: Sequence[Results]) -> Results:
 
     homes = [results.out.resolve() for results in folders]
     base = Path(os.path.commonpath(homes))
-    # The names of the folders or, if some are the same, their paths under `base`.
+    # The names of the folders or, if some names are equal, their paths below `base`.
     labels = [home.name for home in homes]
     if len(set(labels)) < len(labels):
         labels = [str(home.relative_to(base)) for home in homes]
@@ -82,8 +82,8 @@ def combined(folders: Sequence[Results]) -> Results:
 
 
 def _moved(case: CaseResults, prefix: Path, earlier_runs: int) -> CaseResults:
-    """Return the case with its videos below `prefix`, and its runs counted after
-    `earlier_runs`.
+    """Return the case with the paths of its videos below `prefix`, and with `earlier_runs` added to
+    its run numbers.
     """
     episodes = []
     for episode in case.episodes:
@@ -94,7 +94,9 @@ def _moved(case: CaseResults, prefix: Path, earlier_runs: int) -> CaseResults:
 
 
 def _require_different_evaluations(folders: Sequence[Results]) -> None:
-    """Raise `ConfigError` if two folders have the same case, as parts of one evaluation do."""
+    """Raise `ConfigError` if two folders have the same case, since they are then parts of one
+    evaluation.
+    """
     first_folders: dict[str, Path] = {}
     for results in folders:
         for case in results.cases:
@@ -127,7 +129,8 @@ def _clashing_policies(folders: Sequence[Results]) -> set[str]:
             clashing.add(case.policy)
 
     swept = {case.policy for case in all_cases if case.step is not None}
-    # By policy, from the first folder that has it, with what only later ones report.
+    # Metadata of each policy from the first folder with the policy, completed with fields that only
+    # later folders have.
     first_metadata: dict[str, dict[str, Any]] = {}
     for results in folders:
         for name, metadata in results.policies.items():

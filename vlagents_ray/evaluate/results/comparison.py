@@ -1,4 +1,4 @@
-"""Paired comparison of two policies, and of one policy in real time with its synchronous
+"""Paired comparison of two policies, or of a policy in real time with its synchronous
 counterpart.
 """
 
@@ -29,7 +29,8 @@ from vlagents_ray.evaluate.results.reader import (
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
 from vlagents_ray.naming import did_you_mean
 
-# The settings of a policy, in which compared cases may differ. All other settings are the env's.
+# Settings of the policy, which may differ between compared cases. All other settings belong to the
+# env.
 OF_POLICY = frozenset(
     {
         "policy",
@@ -48,22 +49,22 @@ Strata = dict[str, Pairs]  # by env
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """The comparison on one suite, or on all suites together."""
+    """The comparison of two policies on one suite, or on all suites together."""
 
-    suite: str  # or "all"
+    suite: str  # name of the suite, or "all"
     strata: tuple[Pairs, ...]  # by env
-    # McNemar's p-value, adjusted by Holm's method for all comparisons of its family.
+    # McNemar's p-value, adjusted with Holm's method for all comparisons of its family.
     adjusted: float
 
     @property
     def pairs(self) -> Pairs:
-        """The episodes of all envs together."""
+        """The counts for the episodes of all envs together."""
         return sum(self.strata, Pairs())
 
     @property
     def interval(self) -> tuple[float, float]:
-        """(low, high), the 95 % interval of the success rate of A minus that of B
-        (`difference_interval`).
+        """(low, high), the 95 % interval of the success rate of A minus the success rate of B (see
+        `difference_interval`).
         """
         return difference_interval(self.strata)
 
@@ -75,8 +76,8 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Policy id A against policy id B ("NAME", or "NAME@STEP" in a sweep) on the episodes that
-    both finished.
+    """The comparison of policy id A with policy id B ("NAME", or "NAME@STEP" in a sweep) on the
+    episodes that both finished.
     """
 
     a: str
@@ -84,9 +85,9 @@ class Comparison:
     # One line for each suite, in the order of the plan; empty if A and B share only one suite.
     suites: tuple[Line, ...]
     total: Line
-    cases: tuple[CaseResults, ...] = ()  # the cases in real time; only of `clock_gaps`
+    cases: tuple[CaseResults, ...] = ()  # the cases in real time; only set by `clock_gaps`
     changes: tuple[Change, ...] = ()  # accepted differences between the two environments
-    # Shares over the compared cases; None if their environments waited for the policy.
+    # Figures over the compared cases; None if their environments waited for the policy.
     time_share_a: TimeShare | None = None
     time_share_b: TimeShare | None = None
 
@@ -110,22 +111,23 @@ def compare(
     env, number and seed.
 
     Args:
-        results: Results that hold both.
+        results: The results that contain both policies.
         a: A policy id: the policy's name, with "@STEP" in a sweep over checkpoints; one of
             `results.policy_ids`.
         b: The other policy id.
-        timing: "synchronous" or "in real time", for results that have episodes of both, which are
-            never pooled.
+        timing: "synchronous" or "in real time"; required if the results have episodes with both
+            timings, which are never pooled.
         accept_changes: Compare even if files, description or contract of an env differ, or if one
-            of the policies ran with several versions of its files or weights.
+            policy ran with several versions of its files or weights.
 
     Returns:
-        The comparison by suite and in total, by success once.
+        The comparison by suite and in total, based on success once.
 
     Raises:
-        ConfigError: One of the policy ids is unknown, or they share no finished episode, or an env
-            of a suite had different settings for the two, or something changed and
-            `accept_changes` is off, or they share episodes of several clocks and `timing` is None.
+        ConfigError: A policy id is unknown, or the policies share no finished episode, or an env of
+            a suite had different settings for both, or a file or the weights changed and
+            `accept_changes` is False, or the policies share episodes of several clocks and `timing`
+            is None.
     """
     if timing is not None:
         timings = by_timing(results.cases)
@@ -146,15 +148,15 @@ def comparisons(
     """Return `compare` for each of these pairs of policy ids, with p-values adjusted for the number
     of comparisons.
 
-    The comparisons on one suite are one family for Holm's method. The comparisons on all suites
-    together are another family.
+    For Holm's method, the comparisons on one suite are one family, and the comparisons on all
+    suites together are another family.
 
     Args:
-        results: Results that hold all of them.
+        results: The results that contain all policies.
         policy_pairs: The pairs of policy ids.
-        chosen_of: The number of all pairs, if these were chosen by their outcomes. The p-values are
-            then adjusted for all pairs.
-        accept_changes: As for `compare`.
+        chosen_of: The number of all possible pairs, if `policy_pairs` was chosen by the outcomes.
+            The p-values are then adjusted for all possible pairs.
+        accept_changes: As in `compare`.
     """
     not_shown = max(0, (chosen_of or 0) - len(policy_pairs))
     suites_of_pairs: list[dict[str, Strata]] = []
@@ -175,7 +177,8 @@ def comparisons(
             strata_of_pairs[-1] += strata.values()
     totals = _lines(ALL, strata_of_pairs, not_shown)
 
-    # A pair that shares only one suite has no line for it, as the line would repeat the total.
+    # A pair that shares only one suite has no line for this suite, as the line would repeat the
+    # total.
     lines: list[list[Line]] = [[] for _ in policy_pairs]
     for name in names:
         members = []  # indices of the pairs that have a line for this suite
@@ -211,8 +214,8 @@ def comparable(
     *,
     accept_changes: bool = False,
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """Return the pairs of policy ids that `compare` accepts, and the reason for each pair that it
-    does not accept. By default, all pairs are tried.
+    """Return the pairs of policy ids that `compare` accepts, and the reasons why it rejects the
+    other pairs. By default, all pairs are tried.
     """
     if policy_pairs is None:
         policy_pairs = list(itertools.combinations(results.policy_ids, 2))
@@ -228,10 +231,10 @@ def comparable(
 
 
 def clock_gaps(results: Results) -> list[Comparison]:
-    """Compare the suites of each policy in real time (A) with their synchronous counterparts (B).
+    """Compare each policy's suites in real time (A) with their synchronous counterparts (B).
 
-    A is named "POLICY_ID, SUITE in real time", B "POLICY_ID, SUITE". A suite without a counterpart
-    is left out.
+    The name of A is "POLICY_ID, SUITE in real time", and the name of B is "POLICY_ID, SUITE". A
+    suite without a counterpart is left out.
     """
     strata: dict[tuple[str, str], Strata] = {}  # by the names of A and B
     cases: dict[tuple[str, str], list[CaseResults]] = {}
@@ -257,24 +260,24 @@ def clock_gaps(results: Results) -> list[Comparison]:
 
 
 def gap_to_synchronous(results: Results, case: CaseResults) -> float | None:
-    """Return the success rate of a real-time case minus that of its synchronous counterpart, on
-    their common episodes.
+    """Return the success rate of a real-time case minus the success rate of its synchronous
+    counterpart, on their common episodes.
 
-    It is in [-1, 1]; None without a counterpart, or without such episodes.
+    It is in [-1, 1]; None if there is no counterpart, or no common episode.
     """
     counterpart = synchronous_twin(results, case)
     return None if counterpart is None else _pairs(case, counterpart).difference
 
 
 def _time_share(cases: Iterable[CaseResults]) -> TimeShare | None:
-    """Return the figures of all counted episodes of these cases."""
+    """Return the figures over all counted episodes of these cases."""
     return time_share_of(list(itertools.chain.from_iterable(case.counted for case in cases)))
 
 
 def _shared(
     results: Results, a: str, b: str, *, accept_changes: bool
 ) -> tuple[dict[str, Strata], list[Change], list[tuple[CaseResults, CaseResults]]]:
-    """Return the pairs of outcomes by suite and env, the accepted changes between the two, and the
+    """Return the pairs of outcomes by suite and env, the accepted changes between A and B, and the
     compared cases of A and B.
     """
     unknown = sorted({a, b} - set(results.policy_ids))
@@ -313,18 +316,19 @@ def _shared(
     return suites, list(changes), compared
 
 
-_COMPARE_ALL_THE_SAME = "or compare them nevertheless and have the report say so (--accept-changes)"
+_COMPARE_ALL_THE_SAME = "or compare them nevertheless, which the report mentions (--accept-changes)"
 
 
 def _changes_between(
     results: Results, case: CaseResults, other: CaseResults, *, accept_changes: bool
 ) -> list[Change]:
-    """Return what differs between two policies' cases of one env besides the policies.
+    """Return the differences between two policies' cases of one env, other than the policies
+    themselves.
 
     Raises:
-        ConfigError: The settings of the env differ; or its program, description or contract differ,
-            or one of the cases mixes several versions of them or of its policy, and
-            `accept_changes` is off.
+        ConfigError: The settings of the env differ. Or, if `accept_changes` is False: the program,
+            description or contract of the env differ, or one of the cases mixes several versions of
+            them or of its policy.
     """
     for name in sorted((case.settings.keys() | other.settings.keys()) - OF_POLICY):
         value, other_value = case.settings.get(name), other.settings.get(name)
@@ -332,7 +336,7 @@ def _changes_between(
             raise ConfigError(
                 f"compare: expected the same {name} of {case.env!r} for all policies, got "
                 f"{value!r} for {case.policy_id!r} and {other_value!r} for {other.policy_id!r}; "
-                "evaluate both with the same, or give the suites different names"
+                "evaluate both with the same value, or give the suites different names"
             )
 
     changes = program_changes(f"env {case.env}", case.program or None, other.program or None)
@@ -344,8 +348,8 @@ def _changes_between(
     if changes and not accept_changes:
         raise ConfigError(
             f"compare: expected {case.policy_id!r} and {other.policy_id!r} in the same "
-            f"environment, got different ones:\n{listed(changes)}\nevaluate both in the same one, "
-            f"{_COMPARE_ALL_THE_SAME}"
+            f"environment, got different ones:\n{listed(changes)}\nevaluate both in the same "
+            f"environment, {_COMPARE_ALL_THE_SAME}"
         )
 
     mixed = _mixed(results, case, other)
@@ -359,8 +363,8 @@ def _changes_between(
 
 
 def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]:
-    """Return, in words, the properties that differ between episodes of the two cases, or within
-    one of them.
+    """Return descriptions of the properties that differ between the episodes of both cases, or
+    within one of the cases.
     """
     accepted = results.accepted_changes
     counted_by_case = [case.counted_episodes, other.counted_episodes]
@@ -389,7 +393,9 @@ def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]
 
 
 def _pairs(a: CaseResults, b: CaseResults) -> Pairs:
-    """Return the counts of the episodes that both cases have, by success once."""
+    """Return the counts of outcomes over the episodes that both cases have, based on success
+    once.
+    """
     counts: Counter[tuple[bool, bool]] = Counter()
     for episode, solved_by_a in a.solved.items():
         if episode in b.solved:
@@ -405,8 +411,9 @@ def _pairs(a: CaseResults, b: CaseResults) -> Pairs:
 def _lines(suite: str, family: Sequence[Sequence[Pairs]], not_shown: int = 0) -> list[Line]:
     """Return the lines of one family.
 
-    The members that were left out count as undecided (p = 1). Larger p-values never make Holm's
-    method reject more hypotheses, so the family-wise error rate is valid for any choice.
+    The comparisons that were left out count as undecided (p = 1). Larger p-values never make Holm's
+    method reject more hypotheses, so the family-wise error rate holds for any choice of
+    comparisons.
 
     Args:
         suite: The name of the suite, or "all".

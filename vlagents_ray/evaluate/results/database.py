@@ -1,8 +1,9 @@
-"""results.db: its tables, its lock, and how the writing evaluation and readers open it.
+"""The database results.db: its tables, its lock, and the ways in which an evaluation and readers
+open it.
 
-The database uses SQLite's rollback journal with locks of the file system, so hosts may share the
-folder. A write-ahead log would not allow that (https://www.sqlite.org/wal.html). Each episode is
-one commit, which takes a few milliseconds.
+The database uses SQLite's rollback journal with locks of the file system, so several hosts may
+share the folder. A write-ahead log would not allow this (https://www.sqlite.org/wal.html). Each
+episode is one commit, which takes a few milliseconds.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 
 FILE = "results.db"
-RUNNING = "running"  # the state of a run that has not ended, or was killed
+RUNNING = "running"  # recorded state of a run that has not ended, or was killed
 VERSION = 1
 
 SCHEMA = """
@@ -131,7 +132,7 @@ CREATE TABLE workers (
 
 
 def create(db: sqlite3.Connection) -> None:
-    """Make the tables of this version, in one transaction."""
+    """Create the tables of this version, in one transaction."""
     db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
 
 
@@ -144,14 +145,14 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
 
 
 def require_readable(out: Path, db: sqlite3.Connection) -> None:
-    """Raise `ConfigError` for a results file of another version, or with other columns than this
-    version's.
+    """Raise `ConfigError` for a results file of another version, or with columns that differ from
+    this version's.
 
     A file of a third party may contain any text as the name of a column, which `merge` would insert
     into SQL. It may also contain views or triggers, which would run arbitrary SQL when a table is
     read or written.
     """
-    # A virtual table is also listed as a table, so the beginning of the statement is compared.
+    # SQLite also lists a virtual table as a table, so compare the beginning of the SQL statement.
     statements = {"table": "CREATE TABLE", "index": "CREATE INDEX"}
     for object_type, name, sql in db.execute(
         "SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL"
@@ -203,17 +204,17 @@ def _columns(db: sqlite3.Connection, table: str) -> set[str]:
     return {name for (name,) in db.execute("SELECT name FROM pragma_table_xinfo(?)", (table,))}
 
 
-WAIT_S = 60.0  # longest wait for the end of another process's transaction, s
+WAIT_S = 60.0  # maximum wait for the end of another process's transaction, s
 
 
 def read_only(out: Path) -> sqlite3.Connection:
-    """Open `out/results.db` read-only; it may be on a read-only file system."""
+    """Open `out/results.db` read-only; the file may be on a read-only file system."""
     return sqlite3.connect(f"{(out / FILE).resolve().as_uri()}?mode=ro", uri=True, timeout=WAIT_S)
 
 
 LOCK = "results.lock"
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
-_READER_S = 1.0  # longer than `is_locked` of another process holds the lock, s
+_READER_S = 1.0  # s, longer than another process has the lock during `is_locked`
 _RETRY_EVERY_S = 0.01
 
 
@@ -221,7 +222,7 @@ def lock(out: Path) -> int:
     """Lock the folder `out`.
 
     Returns:
-        A file descriptor. Closing it releases the lock, and so does the end of this process.
+        A file descriptor. Closing the descriptor or ending this process releases the lock.
     """
     file = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
     deadline = time.monotonic() + _READER_S
@@ -250,7 +251,7 @@ def lock(out: Path) -> int:
 
 
 def is_locked(out: Path) -> bool:
-    """Return whether an evaluation holds the lock of the folder `out`; True if that cannot be
+    """Return whether an evaluation has locked the folder `out`; True if this cannot be
     determined.
     """
     try:

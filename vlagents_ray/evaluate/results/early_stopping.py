@@ -1,8 +1,8 @@
-"""Early stopping: which cases of a plan need no further episodes.
+"""Early stopping: decides which cases of a plan need no further episodes.
 
-Quick episodes end first, and failures take longest, so the finished episodes are a biased sample.
-Therefore only an unbroken prefix of the planned order counts, and the end of a case depends only on
-its outcomes.
+Successful episodes are short and end first, and failures take longest, so the finished episodes are
+a biased sample. Therefore only an unbroken prefix of the planned order counts. The end of a case
+then depends only on the outcomes, not on durations.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from vlagents_ray.evaluate.results.statistics import confidence_sequence
 
 
 class EarlyStopping:
-    """The state of early stopping of each case of a plan; without a rule no case stops."""
+    """The state of early stopping for each case of a plan; without a rule, no case stops early."""
 
     def __init__(self, plan: ResolvedPlan) -> None:
-        """Begin without results."""
+        """Create the state without results."""
         self._by_case: dict[str, CaseStopping] = {}
         if plan.stop is not None:
             for case in plan.cases:
@@ -32,8 +32,8 @@ class EarlyStopping:
         """Add the result of an episode.
 
         Returns:
-            The number of episodes after which its case stops, if this result decided that; else
-            None.
+            The number of episodes after which the case stops, if this result ends the case;
+            otherwise None.
         """
         case_id = result.key.settings
         if case_id not in self._by_case or self.has_stopped(case_id):
@@ -42,7 +42,7 @@ class EarlyStopping:
         return self._by_case[case_id].at
 
     def has_stopped(self, case_id: str) -> bool:
-        """Return whether the outcomes of the case with this fingerprint suffice."""
+        """Return whether the case with this fingerprint has stopped."""
         stopping = self._by_case.get(case_id)
         return stopping is not None and stopping.at is not None
 
@@ -51,7 +51,7 @@ class CaseStopping:
     """Decides when a case stops. Its episodes may be added in any order."""
 
     def __init__(self, stop: StopConfig, seeds: Sequence[int], planned: int) -> None:
-        """Start without outcomes.
+        """Create the state without outcomes.
 
         Args:
             stop: The settings of early stopping.
@@ -61,10 +61,11 @@ class CaseStopping:
         self._stop = stop
         self._seeds = list(seeds)
         self._episodes_per_seed = planned // len(seeds)
-        self._outcomes: dict[int, bool] = {}  # by index in the plan
+        self._outcomes: dict[int, bool] = {}  # outcomes by index in the plan
         self._in_order = 0  # the number of episodes in the unbroken prefix of the plan
         self._successes = 0  # the number of successes in that prefix
-        self.at: int | None = None  # the number of episodes after which the case stops
+        # The number of episodes after which the case stops; None: not decided yet.
+        self.at: int | None = None
 
     def add_all(self, results: Iterable[EpisodeResult]) -> None:
         """Add the outcomes of several episodes."""
@@ -73,7 +74,7 @@ class CaseStopping:
 
     def add(self, result: EpisodeResult) -> None:
         """Add the outcome of an episode. An episode that failed because of infrastructure has no
-        outcome yet, so those after it do not count until it is repeated.
+        outcome yet, so later episodes do not count until this episode is repeated.
         """
         index = place_in_plan(result.key, self._seeds, self._episodes_per_seed)
         if index is not None and result.success_once is not None:
@@ -85,12 +86,12 @@ class CaseStopping:
                 self.at = self._in_order
 
     def counts(self, key: EpisodeKey) -> bool:
-        """Return whether the episode counts, as it comes before the end of the case."""
+        """Return whether an episode counts, i.e. whether it precedes the end of the case."""
         index = place_in_plan(key, self._seeds, self._episodes_per_seed)
         return self.at is None or (index is not None and index < self.at)
 
     def _is_certain(self) -> bool:
-        """Return whether the interval excludes the target, or is narrow enough."""
+        """Return whether the interval excludes the target rate, or is narrow enough."""
         low, high = confidence_sequence(self._successes, self._in_order, self._stop.error_rate)
         target, width = self._stop.target, self._stop.width
         excludes_target = target is not None and not low <= target <= high

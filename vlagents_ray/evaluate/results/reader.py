@@ -1,4 +1,4 @@
-"""Reads a folder of results."""
+"""The reader of a folder of results."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from vlagents_ray.evaluate.results.database import (
 from vlagents_ray.evaluate.results.early_stopping import CaseStopping, place_in_plan
 from vlagents_ray.evaluate.results.statistics import Rate, median, pooled
 
-KILLED = "killed"  # the state of a run that was killed, so that it recorded no end
+KILLED = "killed"  # state of a run that was killed before it recorded an end
 
-_SQLITE_FULL = 13  # sqlite3.SQLITE_FULL, which Python 3.10 lacks
+_SQLITE_FULL = 13  # value of sqlite3.SQLITE_FULL, which Python 3.10 lacks
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,21 +40,22 @@ class Episode:
     """A recorded episode."""
 
     result: EpisodeResult
-    videos: tuple[str, ...]  # paths relative to the folder
-    trajectory: str | None  # a path relative to the folder
+    videos: tuple[str, ...]  # paths relative to the folder of results
+    trajectory: str | None  # path relative to the folder of results
     attempts: int
     run: int
     finished: float  # seconds since 1970
-    env_program: str | None = None  # digest of the files of its environment, None if installed
-    policy_program: str | None = None  # digest of the files of its policy, None if installed
-    # Whether the episode comes after the end of its stopped case, or is no longer planned.
+    # Digest of the environment's files; None for an installed environment.
+    env_program: str | None = None
+    policy_program: str | None = None  # digest of the policy's files; None for an installed policy
+    # Whether the episode follows the end of its case, which stopped early, or is no longer planned.
     beyond: bool = False
-    unplanned: bool = False  # whether it is no longer planned
+    unplanned: bool = False  # whether the episode is no longer planned
 
     @property
     def counts(self) -> bool:
-        """Whether the rates include the episode: not if it failed because of infrastructure, or
-        is `beyond`.
+        """Whether the rates include the episode. They exclude episodes that failed because of
+        infrastructure or are `beyond`.
         """
         return self.result.status != "infra_failed" and not self.beyond
 
@@ -65,7 +66,7 @@ class Attempt:
 
     key: str  # the key of the episode
     case_id: str
-    attempt: int  # its number, from 1
+    attempt: int  # number of the attempt, from 1
     run: int
     at: float  # seconds since 1970
     cause: str
@@ -78,7 +79,9 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True)
 class Worker(WorkerInfo):
-    """A worker that connected to a policy or made an env. A worker may have several entries."""
+    """A record of a worker that connected to a policy or created an env. A worker may have several
+    records.
+    """
 
     run: int
     at: float  # seconds since 1970
@@ -90,34 +93,35 @@ class Run:
 
     run: int
     started: float  # seconds since 1970
-    ended: float | None  # None: it runs, or was killed
+    ended: float | None  # end of the run; None if the run has not ended, or was killed
     # "complete", "interrupted", "out of time", "stopped" by an error, "running", or "killed".
     state: str
     config: dict[str, Any]
     versions: dict[str, Any]
-    changes: tuple[Change, ...] = ()  # accepted changes in the program since earlier runs
+    changes: tuple[Change, ...] = ()  # accepted changes since earlier runs
 
 
 @dataclass(frozen=True)
 class CaseResults:
     """The results of one case: a policy, at a checkpoint, in an env of a suite."""
 
-    case_id: str  # fingerprint of its settings
+    case_id: str  # fingerprint of the case's settings
     policy: str
     step: int | None
     suite: str
     env: str
     planned: int
     settings: dict[str, Any]
-    described: dict[str, Any]  # `EvalEnv.describe()`; {} if no worker has made the env
+    described: dict[str, Any]  # `EvalEnv.describe()`; {} if no worker has created the env
     contract: dict[str, Any]
-    # The env's commit, dirty and diff_sha256; {} if its code is in no git repository.
+    # Git state of the env's code, with `commit`, `dirty` and `diff_sha256`; {} if the code is not
+    # in a git repository.
     code: dict[str, Any]
     program: dict[str, str]  # digests of the env's files by their names; {} for an installed env
-    episodes: tuple[Episode, ...]  # by seed
+    episodes: tuple[Episode, ...]  # in the order of the seeds
     attempts: tuple[Attempt, ...]
-    stop: StopConfig | None = None  # the rule by which it could stop early
-    # The number of episodes after which the case stopped; later ones are kept, but not counted.
+    stop: StopConfig | None = None  # the rule for stopping the case early
+    # The number of episodes after which the case stopped; later episodes are kept, but not counted.
     stopped_at: int | None = None
 
     @property
@@ -132,20 +136,21 @@ class CaseResults:
         """
         return f"{self.suite} {self.env}".strip()
 
-    # Each comparison of two policies reads these, and a report has one for each pair of policies.
+    # The next three are cached, since each comparison of two policies reads them, and a report
+    # compares each pair of policies.
     @cached_property
     def counted_episodes(self) -> tuple[Episode, ...]:
-        """The episodes that are in the rates."""
+        """The episodes that the rates include."""
         return tuple(episode for episode in self.episodes if episode.counts)
 
     @cached_property
     def counted(self) -> tuple[EpisodeResult, ...]:
-        """The results of the episodes that are in the rates."""
+        """The results of the episodes that the rates include."""
         return tuple(episode.result for episode in self.counted_episodes)
 
     @cached_property
     def solved(self) -> dict[tuple[int, int], bool]:
-        """Whether each episode that is in the rates succeeded once, by its number and seed."""
+        """Success once of each episode that the rates include, by number and seed."""
         return {
             (result.key.episode, result.key.seed): bool(result.success_once)
             for result in self.counted
@@ -161,13 +166,13 @@ class CaseResults:
 class Results:
     """The results of an evaluation from its folder; `Results.load` reads them, without Ray."""
 
-    out: Path  # the folder
+    out: Path  # the folder of results
     cases: tuple[CaseResults, ...]  # in the order of the plan
     runs: tuple[Run, ...]
     # The metadata of each policy's server, by the policy's name.
     policies: dict[str, dict[str, Any]]
-    workers: tuple[Worker, ...] = ()  # in the order of time
-    # The folders, below `out`, if several were read as one (`combined`).
+    workers: tuple[Worker, ...] = ()  # in the order of their time
+    # The folders below `out`, if several folders were combined (see `combined`).
     parts: tuple[Path, ...] = ()
 
     @property
@@ -177,7 +182,7 @@ class Results:
 
     @property
     def counted(self) -> list[EpisodeResult]:
-        """The results of all episodes that are in the rates, case by case."""
+        """The results of all episodes that the rates include, case by case."""
         return list(itertools.chain.from_iterable(case.counted for case in self.cases))
 
     @property
@@ -193,14 +198,14 @@ class Results:
         """Read a folder of results.
 
         Args:
-            out: The folder. An evaluation may be writing to it; nothing in it is changed.
+            out: The folder, which is not changed. An evaluation may be writing to it.
 
         Returns:
-            One consistent state of the results.
+            The results, in one consistent state.
 
         Raises:
-            ConfigError: The folder holds no results, or they are of another version, or cannot be
-                read.
+            ConfigError: The folder contains no results, or the results are of another version or
+                cannot be read.
         """
         out = Path(out)
         was_locked = is_locked(out)
@@ -222,7 +227,7 @@ class Results:
             runs = [_run(row) for row in table(db, "runs")]
             policies = {row["name"]: json.loads(row["metadata"]) for row in table(db, "policies")}
             workers = [Worker(**row) for row in table(db, "workers")]
-            # An evaluation may have begun after the lock was checked first.
+            # Check the lock again, since an evaluation may have begun after the first check.
             is_written = was_locked or is_locked(out)
 
         for index, run in enumerate(runs):
@@ -254,7 +259,7 @@ class Results:
         return [case for case in self.cases if case.policy_id == policy_id]
 
     def file(self, path: str) -> Path:
-        """Return the absolute path of an episode's file with the relative `path`; it need not
+        """Return the absolute path of an episode's file from the relative `path`; the file need not
         exist.
 
         Raises:
@@ -298,13 +303,13 @@ class Results:
 
 @contextmanager
 def reading(out: Path) -> Iterator[sqlite3.Connection]:
-    """Return a context manager that yields a connection to one consistent state of all tables in
-    `out`, even while an evaluation writes.
+    """Return a context manager that yields a connection to `out`, in which all tables are in one
+    consistent state, even while an evaluation writes.
     """
     if not (out / FILE).is_file():
         raise ConfigError(
-            f"{out}: expected a folder that an evaluation wrote, with {FILE} in it, got one "
-            "without; check the path"
+            f"{out}: expected a folder that an evaluation wrote, with {FILE} in it, got a folder "
+            f"without this file; check the path"
         )
     try:
         with closing(read_only(out)) as db:
@@ -314,17 +319,17 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
             db.execute("BEGIN")
             yield db
     except sqlite3.DatabaseError as error:
-        # The caller writes a copy, to a disk that is full.
+        # The error comes from the caller, which writes a copy to a full disk.
         if getattr(error, "sqlite_errorcode", None) == _SQLITE_FULL:
             raise
         raise ConfigError(
             f"{out / FILE}: cannot be read ({error}); if its evaluation was killed, --resume "
-            "repairs it; otherwise copy the whole folder again from where it was written"
+            "repairs it; otherwise copy the whole folder again from its original place"
         ) from error
 
 
 def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
-    """Yield the rows of a table, each as its values by their columns' names."""
+    """Yield the rows of a table, each as a dict of values by the name of the column."""
     rows = db.execute(f"SELECT * FROM {name} ORDER BY {order}")  # noqa: S608 (constants)
     return map(dict, rows)
 
@@ -333,7 +338,7 @@ def episode_of(row: dict[str, Any]) -> Episode:
     """Return the episode of a row of the table.
 
     Raises:
-        ConfigError: One of its paths leads out of the folder.
+        ConfigError: A path leads out of the folder.
     """
     names = {field.name for field in fields(EpisodeResult)} - {"key"}
     values = {name: value for name, value in row.items() if name in names}
@@ -385,8 +390,8 @@ def _case(
     marked = []
     for episode in episodes:
         key = episode.result.key
-        # If the evaluation was resumed with fewer episodes, those beyond them that had already run
-        # would be a biased selection.
+        # If the evaluation was resumed with fewer episodes, the finished episodes beyond this
+        # number would be a biased selection.
         unplanned = place_in_plan(key, seeds, episodes_per_seed) is None
         after_stop = stopping is not None and not stopping.counts(key)
         marked.append(replace(episode, beyond=unplanned or after_stop, unplanned=unplanned))
@@ -406,7 +411,8 @@ def rate_of(
     """Return the success rate of one case, or of several together, with bounds that are valid if
     cases could stop early.
 
-    Cases without a common rate (`have_common_rate`) are counted, and their rate is None.
+    For cases without a common rate (see `have_common_rate`), the counts are summed, but the rate is
+    None.
     """
     counts = []  # (successes, episodes) of each case
     for case in cases:
@@ -424,17 +430,18 @@ def rate_of(
 
 
 def have_common_rate(cases: Sequence[CaseResults]) -> bool:
-    """Return whether the episodes of these cases may be counted in one rate.
+    """Return whether one rate may be computed over the episodes of these cases.
 
-    Cases that stopped after different numbers of episodes may not, as their outcomes would
-    determine their weights. Cases with different clocks may not, as success in real time differs
-    from success while the env waits.
+    Cases that stopped after different numbers of episodes have no common rate, since their outcomes
+    would determine their weights. Cases with different clocks have no common rate, since success in
+    real time differs from success while the env waits.
     """
     return len({case.stopped_at for case in cases}) <= 1 and len(by_timing(cases)) <= 1
 
 
 def time_share_of(results: Sequence[EpisodeResult]) -> TimeShare | None:
-    """Return the figures of episodes in real time, or on a robot, together; None if there are none.
+    """Return the common figures of episodes in real time or on a robot; None if there are no such
+    episodes.
 
     Ticks are summed. The ages are the medians of the episodes' percentiles.
     """
@@ -454,8 +461,8 @@ SYNCHRONOUS, REAL_TIME = "synchronous", "in real time"
 
 
 def by_timing(cases: Sequence[CaseResults]) -> dict[str, list[CaseResults]]:
-    """Group the cases by their clock: "synchronous" first, then "in real time", which has a group
-    for each clock if there are several.
+    """Group the cases by their clock: first "synchronous", then "in real time", with a separate
+    group for each clock if there are several.
     """
     synchronous = [case for case in cases if case.settings.get("clock") is None]
     clocks: dict[str, list[CaseResults]] = {}  # cases in real time, by the settings of their clock
@@ -478,11 +485,11 @@ def synchronous_twin(results: Results, case: CaseResults) -> CaseResults | None:
 
     Args:
         results: The results with both cases.
-        case: Any case of them.
+        case: Any case in the results.
 
     Returns:
-        The case in which the env waited for the policy; None if there is none, or if `case` is
-        synchronous itself.
+        The case in which the env waited for the policy; None if there is no such case, or if `case`
+        itself is synchronous.
     """
     if case.settings["clock"] is None:
         return None

@@ -2,7 +2,8 @@
 
 A confidence sequence is valid at all numbers of episodes simultaneously: the probability that it
 ever misses the true rate is at most the error rate, so the evaluation may stop after any episode.
-An interval for a fixed number of episodes, such as Wilson's, is not valid then.
+An interval for a fixed number of episodes, such as Wilson's, is not valid if the number depends on
+the outcomes.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def wilson(successes: int, trials: int, z: float = Z_95) -> tuple[float, float]:
     for rates of 0 % and 100 %.
 
     Args:
-        successes: The number of trials that succeeded.
+        successes: The number of successful trials.
         trials: The number of trials.
         z: The quantile of the standard normal distribution; the default gives 95 %.
 
@@ -52,8 +53,8 @@ def wilson(successes: int, trials: int, z: float = Z_95) -> tuple[float, float]:
     centre = (rate + z * z / (2 * trials)) / scale
     half_width = z / scale * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
 
-    # Without a success the lower bound is exactly 0, and without a failure the upper one is exactly
-    # 1. Floating point would give 1e-17 and 1 - 1e-16.
+    # Without successes the lower bound is exactly 0, and without failures the upper bound is
+    # exactly 1. Floating point would give 1e-17 and 1 - 1e-16.
     low = 0.0 if successes == 0 else centre - half_width
     high = 1.0 if successes == trials else centre + half_width
     return low, high
@@ -106,8 +107,8 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Counts of the episodes that both A and B ran, by which of them solved the task. Two objects
-    can be added.
+    """Counts of the episodes that both A and B ran, by the outcomes of A and B. Two objects can be
+    added.
 
     Raises:
         InvalidInput: A number is negative.
@@ -137,7 +138,7 @@ class Pairs:
 
     @property
     def difference(self) -> float | None:
-        """Success rate of A minus that of B, in [-1, 1]; None without episodes."""
+        """The success rate of A minus the success rate of B, in [-1, 1]; None without episodes."""
         return (self.only_a - self.only_b) / self.total if self.total else None
 
     @property
@@ -161,12 +162,12 @@ class Pairs:
 
 
 def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
-    """Test the hypothesis that A and B solve equally many episodes, from those that only one of
-    them solved.
+    """Test the hypothesis that A and B solve equally many episodes, using the episodes that only
+    one of them solved.
 
-    The test is exact: under the hypothesis each such episode is A's or B's with probability 1/2,
-    whatever the tasks are, so that tasks of different difficulty may be pooled. Q. McNemar, "Note
-    on the sampling error of the difference between correlated proportions or percentages",
+    The test is exact: under the hypothesis, each of these episodes is solved by A or by B with
+    probability 1/2, whatever the task, so tasks of different difficulty may be pooled. Q. McNemar,
+    "Note on the sampling error of the difference between correlated proportions or percentages",
     Psychometrika 12 (1947).
 
     Args:
@@ -189,14 +190,14 @@ def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
         )
 
     n = only_a + only_b
-    # The numbers of ways to choose k of n, and at most k of n. They are integers, so they are exact
-    # for any number of episodes.
+    # The numbers of ways to choose k of n items, and at most k of n items. They are integers, and
+    # thus exact for any number of episodes.
     ways = tail = 1
     for k in range(min(only_a, only_b)):
         ways = ways * (n - k) // (k + 1)
         tail += ways
 
-    # Both tails contain the observed table, of which half is counted in each.
+    # Both tails contain the observed table, and each tail counts half of it.
     if mid and n and only_a == only_b:
         return 1.0 - ways / (2 << n)
     return min(1.0, (2 * tail - ways * mid) / (1 << n))
@@ -205,15 +206,15 @@ def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
 def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
     """Compute the 95 % interval of a difference of success rates on the same episodes.
 
-    Its bounds are percentiles of a paired bootstrap: episodes are drawn again with both of their
+    The bounds are percentiles of a paired bootstrap: episodes are resampled together with both
     outcomes, separately for each env (a stratum), since each repetition of an evaluation has the
-    same number of episodes of an env. B. Efron, R. J. Tibshirani, "An Introduction to the
+    same number of episodes in an env. B. Efron, R. J. Tibshirani, "An Introduction to the
     Bootstrap" (1993), chapters 8 and 13.
 
-    Two episodes are added, half an episode of each of the four outcomes. Without them, 20 of 20
-    against none, or no episode that distinguishes A from B, would give an interval of zero width,
-    which claims certainty. A. Agresti, Y. Min, "Simple improved confidence intervals for comparing
-    matched proportions", Statistics in Medicine 24 (2005).
+    Two episodes are added, half an episode for each of the four outcomes. Without them, the
+    interval would have zero width, which claims certainty, e.g. for 20 of 20 successes against
+    none, or if A and B agree in every episode. A. Agresti, Y. Min, "Simple improved confidence
+    intervals for comparing matched proportions", Statistics in Medicine 24 (2005).
 
     No random generator is used. In the limit of infinitely many draws, the difference is a sum of
     independent steps of +1, -1 and 0, whose characteristic function is a product.
@@ -222,8 +223,8 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
         strata: The episodes of each env.
 
     Returns:
-        (low, high) of the success rate of A minus that of B, each in [-1, 1]; (-1, 1) without
-        episodes.
+        (low, high) of the success rate of A minus the success rate of B, each in [-1, 1]; (-1, 1)
+        without episodes.
     """
     n = sum(pairs.total for pairs in strata)
     if n == 0:
@@ -236,14 +237,15 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
     for pairs in strata:
         if not pairs.total:
             continue
-        # The count added to each of the four outcomes, in proportion to the env's episodes.
+        # The count to add to each of the four outcomes, proportional to the env's number of
+        # episodes.
         added = _PSEUDO_EPISODES / 4 * pairs.total / n
         total = pairs.total + 4 * added
         up = (pairs.only_a + added) / total
         down = (pairs.only_b + added) / total
         characteristic *= (up * turns + down / turns + (1 - up - down)) ** pairs.total
 
-    # Proportional to the probabilities of the sums -n, …, n.
+    # Values proportional to the probabilities of the sums -n, …, n.
     weights = np.fft.fftshift(np.fft.fft(characteristic).real).clip(min=0.0)
     cumulative = np.cumsum(weights) / weights.sum()
     low, high = np.searchsorted(cumulative, [ERROR_RATE / 2, 1 - ERROR_RATE / 2]) - n
@@ -251,15 +253,15 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjust p-values for their number, by Holm's method.
+    """Adjust p-values for their number with Holm's method.
 
     If every hypothesis with an adjusted p-value below 5 % is rejected, the probability that any of
-    these rejections is wrong is at most 5 %, however the tests depend on one another. S. Holm, "A
+    these rejections is wrong is at most 5 %, even if the tests depend on one another. S. Holm, "A
     simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6
     (1979).
 
     Args:
-        p_values: One for each test, in [0, 1].
+        p_values: The p-value of each test, in [0, 1].
 
     Returns:
         The adjusted p-values, in the same order.
@@ -272,7 +274,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return adjusted
 
 
-_HALVINGS = 60  # halvings that take an interval of length 1 below the resolution of a float
+# Number of halvings that make an interval of length 1 shorter than the resolution of a float.
+_HALVINGS = 60
 
 
 def confidence_sequence(
@@ -281,12 +284,12 @@ def confidence_sequence(
     """Compute an interval of a success probability that is valid after all trials simultaneously.
 
     It is {p : (n + 1) C(n, s) p^s (1 - p)^(n - s) > error_rate}: H. Robbins, "Statistical Methods
-    Related to the Law of the Iterated Logarithm", Ann. Math. Statist. 41 (1970). It is the
+    Related to the Law of the Iterated Logarithm", Ann. Math. Statist. 41 (1970). The method is the
     beta-binomial mixture martingale with a uniform prior. J. Ville's inequality (1939) bounds the
-    probability that it ever reaches 1 / error_rate.
+    probability that the martingale ever reaches 1 / error_rate.
 
     Args:
-        successes: The number of trials that succeeded so far.
+        successes: The number of successful trials so far.
         trials: The number of trials so far.
         error_rate: The largest probability, in (0, 1), that the interval misses the true value at
             any number of trials.
@@ -304,8 +307,8 @@ def confidence_sequence(
         )
 
     failures = trials - successes
-    # The logarithm of (n + 1) C(n, s) / error_rate. The interval consists of the p for which
-    # s log p + (n - s) log(1 - p) is larger than its negative.
+    # The logarithm of (n + 1) C(n, s) / error_rate. The interval contains all p for which s log p +
+    # (n - s) log(1 - p) is larger than the negative of this value.
     room = (
         math.lgamma(trials + 2)
         - math.lgamma(successes + 1)
@@ -325,11 +328,12 @@ def confidence_sequence(
 
 
 def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float, float]:
-    """Return bounds (low, high) of the success rate of several cases, each weighted by its
-    number of episodes.
+    """Return bounds (low, high) of the success rate of several cases, weighted by their numbers of
+    episodes.
 
-    The weights depend on when each case stops. Therefore each case gets an equal share of the error
-    rate: all bounds are then valid simultaneously, and so is any weighted mean of them.
+    The weights depend on the times at which the cases stop. Therefore each case gets an equal share
+    of the error rate: all bounds are then valid simultaneously, and any weighted mean of them is
+    valid, too.
 
     Args:
         counts: The (successes, trials) of each case.
@@ -350,7 +354,9 @@ def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float,
 
 
 def _boundary(is_inside: Callable[[float], bool], inside: float, outside: float) -> float:
-    """Return the first point on the way from `inside` to `outside` that is not inside."""
+    """Return the first point between `inside` and `outside`, coming from `inside`, that is not
+    inside.
+    """
     for _ in range(_HALVINGS):
         middle = (inside + outside) / 2
         if middle in (inside, outside):
@@ -363,6 +369,6 @@ def _boundary(is_inside: Callable[[float], bool], inside: float, outside: float)
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """Return the median of the values that are not None; None if all are."""
+    """Return the median of the values that are not None; None if all values are None."""
     known_values = [value for value in values if value is not None]
     return float(np.median(known_values)) if known_values else None

@@ -1,7 +1,7 @@
 """Writes `results.db`: the state of an evaluation in SQLite, with one transaction for each episode.
 
-A commit survives the end of its process at any time, so an evaluation that is killed and resumed
-has each episode exactly once. Read it with `vlagents_ray.evaluate.results.reader`.
+A commit survives even if the process is killed, so an evaluation that is killed and resumed
+contains each episode exactly once. Read it with `vlagents_ray.evaluate.results.reader`.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ class Store(AbstractContextManager["Store"]):
     """The results of one `out` folder, open for one evaluation at a time."""
 
     def __init__(self, plan: ResolvedPlan) -> None:
-        """Open the results in `plan.out`, or begin new ones.
+        """Open the results in `plan.out`, or create new results.
 
         Raises:
-            ConfigError: The folder has results and `plan.resume` is off, their settings differ,
-                their code or files differ and `plan.accept_changes` is off, or another evaluation
-                is writing to them.
+            ConfigError: The folder has results and `plan.resume` is False; or their settings
+                differ; or their code or files differ and `plan.accept_changes` is False; or another
+                evaluation is writing to the folder.
             StorageFailed: The folder cannot be written to.
         """
         self.cases = plan.cases
@@ -74,11 +74,12 @@ class Store(AbstractContextManager["Store"]):
         self._run = 0  # the number of this run
         self._changes: list[Change] = []  # the accepted changes of this run
         self._accepted: set[Hashable] = set()  # policies, cases and places with accepted changes
-        self._policy_programs: dict[str, str | None] = {}  # by policy
-        self._compared_envs: set[str] = set()  # places whose env was compared with earlier runs
+        self._policy_programs: dict[str, str | None] = {}  # metadata of each policy's server
+        # Places whose env has been compared with earlier runs.
+        self._compared_envs: set[str] = set()
 
-        # The digest of the weights by case, and by (policy, step, checkpoint); read from the
-        # database when it is first needed.
+        # Digests of the weights by case, and by (policy, step, checkpoint); read from the database
+        # at the first use.
         self._weights: dict[Hashable, str] = {}
 
         try:
@@ -97,7 +98,7 @@ class Store(AbstractContextManager["Store"]):
         os.close(self._lock)
 
     def begin_run(self, versions: dict[str, Any], started: float | None = None) -> None:
-        """Record that a run over the plan begins, or began at `started`, s since 1970."""
+        """Record that a run over the plan begins now, or began at `started`, s since 1970."""
         row = (
             time.time() if started is None else started,
             RUNNING,
@@ -122,7 +123,7 @@ class Store(AbstractContextManager["Store"]):
             )
 
     def finished(self) -> set[str]:
-        """Return the keys of the episodes that will not run again."""
+        """Return the keys of the episodes that have a result and will not run again."""
         query = "SELECT key FROM episodes WHERE status != 'infra_failed'"
         return {key for (key,) in self._db.execute(query)}
 
@@ -134,15 +135,17 @@ class Store(AbstractContextManager["Store"]):
         trajectory: str | None = None,
         finished: float | None = None,
     ) -> None:
-        """Record an episode that finished now or at `finished`, s since 1970.
+        """Record an episode that finished now, or at `finished`, s since 1970.
 
         It replaces an episode with the same key that failed because of infrastructure. An episode
-        with a result is never changed.
+        that has a result is never changed.
 
         Raises:
             ConfigError: The episode ran with another checkpoint than earlier episodes of its case,
-                or with other weights of the same name. All episodes of a rate need one checkpoint.
-            WeightsLost: It ran with other weights than the pushed ones that its case evaluates.
+                or with other weights of the same name. All episodes of a success rate need the same
+                checkpoint.
+            WeightsLost: The episode ran with weights other than the pushed weights that its case
+                evaluates.
         """
         case = self._cases_by_id[result.key.settings]
         _require_pushed_weights(case, result)
@@ -151,7 +154,7 @@ class Store(AbstractContextManager["Store"]):
 
         row = asdict(result)
         key = row.pop("key")
-        del key["policy_seed"]  # in an evaluation, it equals the environment's seed
+        del key["policy_seed"]  # in an evaluation, the policy's seed equals the environment's seed
         row |= {
             "key": str(result.key),
             "case_id": key.pop("settings"),
@@ -172,7 +175,7 @@ class Store(AbstractContextManager["Store"]):
             insert(self._db, "episodes", row)
 
     def _require_same_checkpoint(self, result: EpisodeResult) -> None:
-        """Raise `ConfigError` if other episodes of the case ran with another checkpoint."""
+        """Raise `ConfigError` if earlier episodes of the case ran with another checkpoint."""
         query = (
             "SELECT checkpoint FROM episodes WHERE case_id = ? AND checkpoint IS NOT NULL LIMIT 1"
         )
@@ -188,8 +191,8 @@ class Store(AbstractContextManager["Store"]):
             )
 
     def _require_same_weights(self, result: EpisodeResult) -> None:
-        """Require the same weights as in earlier episodes of the case, and in other cases with the
-        same checkpoint, unless changes are accepted.
+        """Raise `ConfigError` unless the weights equal the weights of earlier episodes of the case
+        and of other cases with the same checkpoint, or changes are accepted.
         """
         if result.weights is None:
             return
@@ -221,10 +224,11 @@ class Store(AbstractContextManager["Store"]):
     def _accept_or_raise(
         self, subject: Hashable, changes: list[Change], where: str, cure: str = MIX
     ) -> None:
-        """Record changes since earlier runs, once for each subject in a run; raise `ConfigError`
-        unless they are accepted.
+        """Record changes since earlier runs, once per subject in a run, or raise `ConfigError` if
+        the plan does not accept changes.
 
-        A second change of a subject within a run means that processes have different files.
+        If a subject changes again within a run, the processes of the run have different files,
+        which is an error.
         """
         if not changes:
             return
@@ -268,39 +272,40 @@ class Store(AbstractContextManager["Store"]):
             insert(self._db, "attempts", row)
 
     def note_worker(self, worker: WorkerInfo) -> None:
-        """Record a worker that has connected to its policy, or made its env."""
+        """Record a worker that has connected to its policy, or created its env."""
         with self._db:
             insert(self._db, "workers", asdict(worker) | {"run": self._run, "at": time.time()})
 
     def note_env(self, place: str, env_info: EnvInfo) -> None:
-        """Record the description, contract and code of an env that a worker has made.
+        """Record the description, contract and code of an env that a worker has created.
 
         Args:
             place: Suite and env of the cases (`EvalCase.place`).
-            env_info: The facts that the worker reports.
+            env_info: The description that the worker reports.
 
         Raises:
             ConfigError: The description or the contract differs from an earlier run, for example
-                after an update of the simulator, or the worker has other files than the process
-                that made the plan.
+                after an update of the simulator, or the worker's files differ from the files of the
+                process that created the plan.
         """
         cases = [case for case in self.cases if case.place == place]
         env = cases[0].env
         changes = program_changes(f"env {env}", cases[0].program, env_info.program)
-        # A new file is allowed: the environment itself may write a file that its settings name.
+        # New files are allowed: the environment itself may write a file that its settings name.
         if any(change.was is not None for change in changes):
             raise ConfigError(
-                f"expected the files of this process on the worker at {env_info.host}, got others, "
-                f"or they were edited since the start:\n{listed(changes)}\ngive both the same "
+                f"expected the files of this process on the worker at {env_info.host}, got other "
+                f"files, or the files were edited since the start:\n{listed(changes)}\ngive both "
+                f"the same "
                 "files, and continue with --resume"
             )
 
-        # The env is compared once in a run, as descriptions may differ between nodes.
+        # Compare the env only once in a run, since descriptions may differ between nodes.
         if place not in self._compared_envs:
             self._compared_envs.add(place)
             self._require_same_env(cases, env_info)
 
-        # An empty description or contract says nothing, so that an earlier one stays known.
+        # An empty description or contract does not replace an earlier one.
         described = json.dumps(env_info.described, default=str) if env_info.described else None
         contract = canonical(env_info.contract) if env_info.contract else None
         code = {} if env_info.code is None else env_info.code.to_json()
@@ -313,11 +318,11 @@ class Store(AbstractContextManager["Store"]):
             )
 
     def _require_same_env(self, cases: Sequence[EvalCase], env_info: EnvInfo) -> None:
-        """Require the description and the contract that earlier runs recorded for any of the
-        cases, unless changes are accepted.
+        """Raise `ConfigError` unless the description and the contract equal those of earlier runs
+        for any of the cases, or changes are accepted.
 
-        The cases share one env. They include those of all policies, as policies are compared with
-        each other.
+        The cases share one env. They include the cases of all policies, since policies are compared
+        with each other.
         """
         env, place = cases[0].env, cases[0].place
         now = EnvStatement(
@@ -338,7 +343,7 @@ class Store(AbstractContextManager["Store"]):
         """Record the metadata of a policy's server.
 
         Raises:
-            ConfigError: It is another policy than in earlier runs.
+            ConfigError: The policy differs from the policy of earlier runs.
         """
         row = self._db.execute("SELECT metadata FROM policies WHERE name = ?", (name,)).fetchone()
         earlier = None if row is None else json.loads(row[0])
@@ -363,7 +368,7 @@ class Store(AbstractContextManager["Store"]):
             self._db.execute("INSERT OR REPLACE INTO policies VALUES (?, ?)", (name, value))
 
     def _open(self) -> sqlite3.Connection:
-        # By SQLite's default, each commit reaches the disk.
+        # With SQLite's default settings, each commit is flushed to the disk.
         db = sqlite3.connect(self.out / FILE, timeout=WAIT_S)
         try:
             if db.execute("PRAGMA user_version").fetchone()[0] == 0:
@@ -399,9 +404,10 @@ class Store(AbstractContextManager["Store"]):
         return db
 
     def _require_resumable(self, db: sqlite3.Connection) -> None:
-        """Require that the results in the folder, if any, may be continued by this plan.
+        """Raise `ConfigError` unless this plan may continue the results in the folder, if there are
+        any.
 
-        The rows of an earlier plan that could not begin are deleted.
+        Rows of an earlier plan whose run never began are deleted.
         """
         (runs,) = db.execute("SELECT COUNT(*) FROM runs").fetchone()
         (episodes,) = db.execute("SELECT COUNT(*) FROM episodes").fetchone()
@@ -418,7 +424,7 @@ class Store(AbstractContextManager["Store"]):
         if not runs or could_not_begin:
             with db:
                 for table in ("attempts", "cases", "policies", "workers", "runs"):
-                    db.execute(f"DELETE FROM {table}")  # noqa: S608 - one of these names
+                    db.execute(f"DELETE FROM {table}")  # noqa: S608 - one of these constants
             return
 
         if not self._plan.resume:
@@ -434,26 +440,26 @@ class Store(AbstractContextManager["Store"]):
             listing = "\n".join(differences)
             raise ConfigError(
                 f"{self.out}: expected results of these settings, got results of "
-                f"others:\n{listing}\nuse the old settings, or choose another out folder"
+                f"others:\n{listing}\nuse the earlier settings, or choose another out folder"
             )
 
         self._accept_or_raise(
             "plan",
             self._other_plan(db),
             "this plan is not that of the results in",
-            "plan all of it; give a new folder (--out); or continue with this plan and have the "
-            "report say so (--accept-changes)",
+            "plan all of it; choose a new folder (--out); or continue with this plan, which the "
+            "report will mention (--accept-changes)",
         )
         self._accept_or_raise(
             "program", self._other_programs(db), "the environment is not that of the results in"
         )
 
     def _stopping_rule(self) -> str | None:
-        """Return the rule of early stopping as the table of cases has it."""
+        """Return the rule of early stopping in the format of the table of cases."""
         return None if self._plan.stop is None else self._plan.stop.model_dump_json()
 
     def _other_programs(self, db: sqlite3.Connection) -> list[Change]:
-        """Return the changes of the environments' files since earlier runs."""
+        """Return the changes in the environments' files since earlier runs."""
         query = "SELECT program FROM cases WHERE case_id = ? AND program IS NOT NULL"
         changes: dict[Change, None] = {}
         for case in self.cases:
@@ -464,12 +470,13 @@ class Store(AbstractContextManager["Store"]):
         return list(changes)
 
     def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
-        """Return the cases and episodes of the results that this plan lacks, and other rules of
+        """Return the cases and episodes of the results that this plan lacks, and changed rules of
         early stopping.
 
-        A plan may grow; for example, `--watch` adds the steps of a policy in turn. A trainer
-        evaluates the versions of its policies in turn into one folder, each with a plan that has
-        only its own cases, so the cases of other policies do not count as missing.
+        A plan may grow; for example, `--watch` adds one step of a policy after another. A trainer
+        evaluates the versions of its policies one after another into one folder, and each plan
+        contains only the cases of one policy. So the cases of other policies do not count as
+        missing.
         """
         is_training = all(case.policy.pushed_weights for case in self.cases)
         policies = {case.policy.name for case in self.cases}
@@ -495,7 +502,9 @@ class Store(AbstractContextManager["Store"]):
 
 
 def _require_pushed_weights(case: EvalCase, result: EpisodeResult) -> None:
-    """Raise `WeightsLost` if other weights acted than the pushed ones that the case evaluates."""
+    """Raise `WeightsLost` if an action was computed with weights other than the pushed weights that
+    the case evaluates.
+    """
     pushed = case.policy.pushed_weights
     if pushed is None or result.policy_version is None:
         return
@@ -505,7 +514,7 @@ def _require_pushed_weights(case: EvalCase, result: EpisodeResult) -> None:
         raise WeightsLost(
             f"policy: expected version {pushed.version} of the weights ({pushed.fingerprint}) in "
             f"{result.key}, got {first} to {last} ({result.policy_fingerprint}); push nothing "
-            "while a version is evaluated, and let the policy's `options` choose no other"
+            f"while a version is evaluated, and select no other version with the policy's `options`"
         )
 
 
@@ -515,7 +524,7 @@ def _plan_changes(
     """Return the seeds and episodes in the results that the plan of a case lacks, and a change of
     its rule of early stopping.
 
-    Without this check, an evaluation could end when its rate happens to be high.
+    Without this check, one could end an evaluation when the rate happens to be high.
     """
     seeds = json.loads(seeds_json)
     episodes = planned // len(seeds)
@@ -531,10 +540,10 @@ def _plan_changes(
 
 
 def _differences(db: sqlite3.Connection, case: EvalCase) -> list[str]:
-    """Return a sentence for each setting of `case` that differs from the results; none for a new
+    """Return a sentence for each setting of `case` that differs from the results; empty for a new
     case.
 
-    The first seeds must be the same, as the number of an episode would otherwise mean two different
+    The first seeds must be equal; otherwise the number of an episode would refer to two different
     episodes.
     """
     row = db.execute(
@@ -546,7 +555,8 @@ def _differences(db: sqlite3.Connection, case: EvalCase) -> list[str]:
         return []
     recorded, recorded_seeds = map(json.loads, row)
 
-    differing: list[tuple[str, Any, Any]] = []  # (name, recorded value, planned value)
+    # (name, recorded value, planned value) of each difference.
+    differing: list[tuple[str, Any, Any]] = []
     for name, value in case.settings.items():
         if recorded.get(name) != value:
             differing.append((name, recorded.get(name), value))

@@ -32,25 +32,28 @@ Reported = Literal["checkpoint", "weights", "revision"]  # fields of an episode'
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Aggregates over the episodes of one case, or of several.
+    """Aggregates over the episodes of one or several cases.
 
     Rates count an error of the policy as a failure. Episodes that failed because of infrastructure
     are excluded from all rates.
     """
 
-    policy_id: str  # the name of the policy, with "@STEP" in a sweep; or "total"
+    policy_id: str  # the policy id, or "total"
     suite: str
-    env: str  # or "total"
+    env: str  # the name of the env, or "total"
     planned: int
     stopped: int  # number of cases that stopped early
     success_once: Rate
     success_at_end: Rate
-    policy_errors: int  # number of episodes that ended with an error of the policy; not successes
-    infra_failures: int  # number of episodes that failed because of infrastructure; in no rate
+    # Number of episodes that ended with an error of the policy; they count as failures.
+    policy_errors: int
+    # Number of episodes that failed because of infrastructure; excluded from all rates.
+    infra_failures: int
     retries: int  # number of attempts that failed because of infrastructure and were repeated
     steps: int  # number of actions executed in all episodes
-    mean_steps: float | None  # None if the episodes have no common rate; also `mean_return`
-    mean_return: float | None  # mean of the episodes' sums of rewards
+    # None if the episodes have no common rate; the same applies to `mean_return`.
+    mean_steps: float | None
+    mean_return: float | None  # mean of the episodes' returns
     env_step_ms: float | None  # median of the episodes' medians
     policy_ms: float | None  # median of the episodes' medians
     policy_p95_ms: float | None  # median of the episodes' 95th percentiles
@@ -62,10 +65,11 @@ class Group:
         return self.success_once.episodes
 
     def with_lost(self, rate: Rate) -> tuple[float, float] | None:
-        """Return the bounds of `rate` with the lost episodes, if all of them had failed and if all
-        had succeeded.
+        """Return the values that `rate` would have with the lost episodes, if all of them had
+        failed and if all had succeeded.
 
-        Losses may depend on the policy, for example if its actions make a simulator fail.
+        These bounds matter because losses may depend on the policy, for example if its actions make
+        a simulator fail.
 
         Returns:
             (low, high) in [0, 1]; None if no episode was lost, or the episodes have no common rate.
@@ -93,15 +97,15 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """The outcome of an evaluation, as `evaluate` returns it; `to_json` is the content of
+    """The outcome of an evaluation, which `evaluate` returns; `to_json` returns the content of
     summary.json.
     """
 
     results: Results
     cases: tuple[Group, ...]
-    totals: tuple[Group, ...]  # one for each policy id, in the order of `results.policy_ids`
-    wall_seconds: float  # sum over all runs, including the start of the workers
-    rollout_seconds: float  # sum over all runs of the time from the first reset to the last step
+    totals: tuple[Group, ...]  # a group for each policy id, in the order of `results.policy_ids`
+    wall_seconds: float  # duration, summed over all runs, including the start of the workers
+    rollout_seconds: float  # time from the first reset to the last step, summed over all runs
 
     @property
     def out(self) -> Path:
@@ -110,16 +114,16 @@ class Summary:
 
     @property
     def state(self) -> str:
-        """The state of the last run, as in `Run.state`."""
+        """The state of the last run, see `Run.state`."""
         return self.results.runs[-1].state
 
     @property
     def total(self) -> Group:
-        """All episodes together."""
+        """The group of all episodes."""
         return group_of((TOTAL, "", TOTAL), self.results.cases)
 
     def parts(self, policy_id: str) -> dict[str, Group]:
-        """Return the totals of a policy id, by the clock of their episodes (`by_timing`)."""
+        """Return the totals of a policy id for each clock of its episodes (see `by_timing`)."""
         return {
             timing: group_of((policy_id, "", TOTAL), cases)
             for timing, cases in by_timing(self.results.of(policy_id)).items()
@@ -127,7 +131,7 @@ class Summary:
 
     @property
     def has_one_rate_each(self) -> bool:
-        """Whether each policy id has one rate for all its cases with one clock."""
+        """Whether each policy id has a common rate for all its cases with the same clock."""
         for policy_id in self.results.policy_ids:
             groups = self.parts(policy_id).values()
             if not all(group.success_once.pooled for group in groups):
@@ -136,10 +140,11 @@ class Summary:
 
     @property
     def best(self) -> list[str]:
-        """The policy ids, the best first, by the mean success rate of their cases with one clock.
+        """The policy ids, best first, sorted by the mean success rate of their cases with the same
+        clock.
 
-        The clock is the first one of `by_timing`: the synchronous one, if any episodes waited for
-        the policy.
+        The clock is the first one in `by_timing`: the synchronous clock, if there are synchronous
+        episodes.
         """
         rates: dict[str, list[float]] = {name: [] for name in self.results.policy_ids}
         timings = list(by_timing(self.results.cases).values())
@@ -153,27 +158,23 @@ class Summary:
 
     @property
     def transports(self) -> list[str]:
-        """The transports by which observations reached the policies."""
+        """The transports with which observations were sent to the policies."""
         return sorted({result.transport for result in self.results.counted})
 
     @property
     def steps_per_second(self) -> float | None:
-        """Env steps of all workers together per second of `wall_seconds`; None if no time has
-        passed.
-        """
+        """Env steps of all workers per second of `wall_seconds`; None if no time has passed."""
         return self.total.steps / self.wall_seconds if self.wall_seconds else None
 
     @property
     def rollout_steps_per_second(self) -> float | None:
-        """Env steps of all workers together per second of `rollout_seconds`; None if no time has
-        passed.
-        """
+        """Env steps of all workers per second of `rollout_seconds`; None if no time has passed."""
         return self.total.steps / self.rollout_seconds if self.rollout_seconds else None
 
     @property
     def env_busy(self) -> float | None:
-        """The share of the workers' time in which they reset and stepped environments; None on a
-        robot.
+        """The share of the workers' time that was spent on resets and steps of environments; None
+        on a robot.
         """
         simulated = [result for result in self.results.counted if result.env_seconds is not None]
         busy_s = [result.env_seconds for result in simulated]
@@ -181,8 +182,8 @@ class Summary:
 
     @property
     def policy_busy(self) -> float | None:
-        """The share of `rollout_seconds` in which policies computed, which may exceed 1 with
-        several replicas; None if no time has passed.
+        """The computing time of the policies as a share of `rollout_seconds`, which may exceed 1
+        with several replicas; None if no time has passed.
         """
         computed_s = [result.policy_seconds for result in self.results.counted]
         return _share(computed_s, self.rollout_seconds)
@@ -209,7 +210,7 @@ class Summary:
         }
 
     def _case_json(self, group: Group, case: CaseResults) -> dict[str, Any]:
-        """Return the entry of a case, of which `group` is the aggregate."""
+        """Return the JSON entry of a case, whose aggregate is `group`."""
         weights = {field: reported(case, field) for field in get_args(Reported)}
         return (
             group.to_json()
@@ -236,7 +237,7 @@ def summarize(results: Results) -> Summary:
         begins = [episode.finished - episode.result.seconds for episode in played]
         last_end = max((episode.finished for episode in played), default=run.started)
 
-        # A run that was killed has no end of its own; it ended with its last episode.
+        # A killed run has no recorded end; the end of its last episode is used.
         end = last_end if run.ended is None else run.ended
         wall_s += end - run.started
         rollout_s += last_end - min(begins, default=last_end)
@@ -248,7 +249,7 @@ def summarize(results: Results) -> Summary:
 
 def reported(case: CaseResults, field: Reported) -> str | None:
     """Return the checkpoint, the digest of the weights, or the weights' commit on the hub; None if
-    the policy did not report it.
+    the policy did not report this value.
     """
     for result in case.counted:
         value: str | None = getattr(result, field)
@@ -258,12 +259,13 @@ def reported(case: CaseResults, field: Reported) -> str | None:
 
 
 def pushed_of(case: CaseResults) -> str | None:
-    """Return the pushed weights of a case's episodes, in words; None if only the checkpoint's
-    weights acted.
+    """Return a text about the pushed weights of a case's episodes; None if only the checkpoint's
+    weights were used.
 
-    If several versions acted in a case, its rate describes none of them.
+    If several versions were used in a case, its rate describes none of them.
     """
-    fingerprints: dict[int, str | None] = {}  # of the weights of the last actions, by version
+    # Fingerprint of each version of the weights that computed a last action.
+    fingerprints: dict[int, str | None] = {}
     versions: set[int] = set()
     for result in case.counted:
         if result.policy_version is not None:
@@ -281,8 +283,8 @@ def pushed_of(case: CaseResults) -> str | None:
 
 
 def cause_of(error: str) -> str:
-    """Return the first line of an error, without the numbers and ids in which errors with the same
-    cause differ.
+    """Return the first line of an error, without numbers and ids, which differ between errors with
+    the same cause.
     """
     return re.sub(r"[0-9a-f]{8,}|\d+(\.\d+)?", "…", error.strip().partition("\n")[0])
 
@@ -291,7 +293,7 @@ def errors_of_policies(results: Results) -> list[tuple[tuple[str, str, str], int
     """Return the errors that ended episodes, one for each cause: (policy id, task, error) and the
     number of episodes.
     """
-    by_cause: dict[tuple[str, str, str], list[str]] = {}  # by policy id, task and cause
+    by_cause: dict[tuple[str, str, str], list[str]] = {}  # errors by policy id, task and cause
     for case in results.cases:
         for result in case.counted:
             if result.status == "policy_error":
@@ -314,7 +316,9 @@ def failing_cases(results: Results) -> list[CaseResults]:
 
 
 def write_summary(summary: Summary) -> Path:
-    """Write summary.json into the folder of results, completely or not at all; return its path."""
+    """Write summary.json into the folder of results, completely or not at all, and return the path
+    of the file.
+    """
     path = summary.out / FILE
     text = json.dumps(summary.to_json(), indent=2) + "\n"
     with whole(path) as temporary:
@@ -359,6 +363,6 @@ def group_of(name: tuple[str, str, str], cases: Sequence[CaseResults]) -> Group:
 
 
 def _share(seconds: Sequence[float | None], total_s: float) -> float | None:
-    """Return the sum of the known `seconds` as a share of `total_s`; None if none is known."""
+    """Return the sum of the known `seconds` as a share of `total_s`; None if no value is known."""
     known_s = [value for value in seconds if value is not None]
     return sum(known_s) / total_s if known_s and total_s else None

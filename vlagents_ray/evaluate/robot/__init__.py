@@ -1,9 +1,9 @@
-"""Blind evaluation on a real robot: an operator resets the scene and judges, without seeing which
-policy runs.
+"""Blind evaluation on a real robot: an operator resets the scene and judges each trial without
+knowing which policy runs.
 
-`evaluate_on_robot` runs a plan's trials in an order that the plan's key draws (`schedule`). The
-operator is an `Operator`: at a page in the browser (`PageOperator`), at a terminal
-(`TerminalOperator`), or any class with the same methods.
+`evaluate_on_robot` runs a plan's trials in a random order, which is derived from the plan's key
+(see `schedule`). The operator answers through an `Operator`: a page in the browser
+(`PageOperator`), a terminal (`TerminalOperator`), or any class with the same methods.
 """
 
 from vlagents_ray.evaluate.robot.operator import (

@@ -1,4 +1,6 @@
-"""The operator at the robot, who answers questions at a terminal or at a page in the browser."""
+"""The interface to the operator at the robot, who answers questions at a terminal or on a page in
+the browser.
+"""
 
 from __future__ import annotations
 
@@ -42,9 +44,9 @@ _CHOICES: dict[str, set[str]] = {
     "playing": {"stop"},
     "verdict": {*_OUTCOMES.values()},
 }
-_AWAY_S = 3.0  # time without a request of the page after which the page counts as closed, s
-_LOOK_S = 0.1  # period of live pictures while the scene is set, s
-_BODY = 10_000  # most bytes of an answer
+_AWAY_S = 3.0  # s; the page counts as closed after this time without a request
+_LOOK_S = 0.1  # period of live pictures while the operator sets the scene, s
+_BODY = 10_000  # maximum size of an answer, bytes
 _PAGE_QUALITY = 80  # JPEG quality of live pictures
 _FILES = {
     "operator.html": "text/html",
@@ -63,7 +65,7 @@ _HEADERS = {
 
 @dataclass(frozen=True, slots=True)
 class VisibleTrial:
-    """The operator's view of a trial, which does not depend on the policy."""
+    """The part of a trial that the operator may see; it does not depend on the policy."""
 
     number: int  # from 1
     total: int  # number of planned trials
@@ -74,12 +76,12 @@ class VisibleTrial:
     setup: str  # instructions for setting the scene
     seconds: float  # time limit of the trial
     rubric: Mapping[str, float]  # points by part of the task
-    # The JPEG of each camera at the scene's first start.
+    # The JPEG of each camera when this scene was first started.
     start: Mapping[str, Path] = field(default_factory=dict)
-    message: str = ""  # how the last attempt ended, if it has no verdict
+    message: str = ""  # how the last attempt ended, if it has no verdict; otherwise empty
 
     def to_json(self) -> dict[str, Any]:
-        """Return the fields for JSON, with the names of the cameras in place of the start
+        """Return the fields for JSON, with the names of the cameras instead of the start
         pictures.
         """
         return asdict(self) | {"rubric": dict(self.rubric), "start": sorted(self.start)}
@@ -90,8 +92,8 @@ class Verdict:
     """The operator's judgement of a trial."""
 
     outcome: Outcome
-    earned: tuple[str, ...] = ()  # the parts of the rubric that were reached, in a partial success
-    note: str = ""  # any text; required for "repeat", where it is the reason
+    earned: tuple[str, ...] = ()  # for a partial success, the parts of the rubric that were reached
+    note: str = ""  # any text; for "repeat", the required reason
 
     def score(self, rubric: Mapping[str, float]) -> float:
         """Return the share of the rubric's points that were earned: 1 for a success, 0 for a
@@ -106,7 +108,7 @@ class Verdict:
         """
         if self.outcome == "repeat" and not self.note.strip():
             raise ConfigError(
-                "verdict: expected a reason in words for a repetition, got none; give one"
+                "verdict: expected a reason for the repetition, got none; write a reason"
             )
         if self.outcome != "partial":
             return float(self.outcome == "success")
@@ -123,10 +125,10 @@ class Verdict:
 
 
 class Operator(Protocol):
-    """The interface of the operator. The methods are called on one thread, in this order."""
+    """The interface to the operator. All methods are called on one thread, in this order."""
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
-        """Wait until the scene is set. The robot stays still.
+        """Wait until the operator has set the scene. The robot stays still.
 
         Args:
             trial: The next trial.
@@ -137,7 +139,7 @@ class Operator(Protocol):
         """
 
     def watch(self, obs: Obs) -> None:
-        """Show an observation of the running trial. It is called at each control tick, so it must
+        """Show an observation of the running trial. This is called at each control tick, so it must
         return immediately.
         """
 
@@ -147,14 +149,14 @@ class Operator(Protocol):
         """
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
-        """Ask for the verdict. The robot stays still.
+        """Ask the operator for the verdict. The robot stays still.
 
         Args:
             trial: The trial that has ended.
             ending: The end of the trial, in words.
 
         Returns:
-            The verdict. If the trial is to be repeated, its note is the reason.
+            The verdict. If the trial must be repeated, the verdict's note is the reason.
 
         Raises:
             KeyboardInterrupt: The operator has left. The trial will be repeated.
@@ -162,23 +164,25 @@ class Operator(Protocol):
 
 
 def start_pictures(out: Path, scene: str) -> dict[str, Path]:
-    """Return the JPEG of each camera from the first start of a scene; {} if it has not started."""
+    """Return the JPEG of each camera from the first start of a scene; {} if the scene has not been
+    started.
+    """
     return {path.stem: path for path in sorted((out / SCENES / scene).glob("*.jpg"))}
 
 
 def save_start(out: Path, scene: str, obs: Obs) -> None:
-    """Save the pictures of a scene at its start, and replace earlier ones."""
+    """Save the pictures of a scene at its start, and replace earlier pictures."""
     for camera, name in distinct(obs.cameras).items():
         with whole(out / SCENES / scene / f"{name}.jpg") as unfinished_path:
             unfinished_path.write_bytes(encode_jpeg(obs.cameras[camera], _START_QUALITY))
 
 
 def save_overlay(start: Path, now: np.ndarray) -> Path:
-    """Save the mean of a start picture and the camera's present picture, next to the folder of the
+    """Save the mean of a camera's start picture and present picture, next to the folder of the
     start picture.
 
     Returns:
-        The new JPEG, of the size of `now`. If the sizes differ, it shows only `now`.
+        The new JPEG, with the size of `now`. If the sizes differ, it shows only `now`.
     """
     start_picture = decode(start.read_bytes())
     if start_picture.shape == now.shape:
@@ -213,8 +217,8 @@ class TerminalOperator(Operator):
         self._stopping = _enter_pressed if stopping is None else stopping
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
-        """Print the trial and the setup of its scene, and wait for Enter. The input "q", or the end
-        of the input, ends the evaluation.
+        """Print the trial and the instructions for its scene, and wait for Enter. The input "q", or
+        the end of the input, ends the evaluation.
         """
         self._say(f"\ntrial {trial.number} of {trial.total}: {trial.task}, scene {trial.scene}")
         pictures = (f"set it as in {picture}" for picture in trial.start.values())
@@ -241,9 +245,10 @@ class TerminalOperator(Operator):
         return self._stopping()
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
-        """Ask for the outcome, for each part of the rubric in a partial success, and for a note.
+        """Ask for the outcome, for the reached parts of the rubric in a partial success, and for a
+        note.
 
-        The questions are repeated until the verdict is valid.
+        Repeat the questions until the verdict is valid.
         """
         self._say(f"trial {trial.number} has ended: {ending}")
         partial = "p partial, " if trial.rubric else ""
@@ -268,7 +273,7 @@ class TerminalOperator(Operator):
                 return verdict
 
     def _earned_parts(self, rubric: Mapping[str, float]) -> tuple[str, ...]:
-        """Ask for each part of the rubric whether it was reached."""
+        """Ask, for each part of the rubric, whether it was reached."""
         earned = []
         for name, points in rubric.items():
             answer = self._ask(f"  {name} ({points:g} points), reached? y/n: ")
@@ -278,15 +283,15 @@ class TerminalOperator(Operator):
 
     def _look(self, trial: VisibleTrial, obs: Obs) -> None:
         if not trial.start:
-            self._say("  this scene has no start picture yet: one is taken when you begin")
+            self._say("  this scene has no start picture yet: it is taken when you begin")
         for camera, name in distinct(obs.cameras).items():
             if name in trial.start:
                 self._say(f"  {save_overlay(trial.start[name], obs.cameras[camera])}")
 
 
 def _enter_pressed() -> bool:
-    """Return whether a line was typed at the terminal; False if the input is not a terminal, as
-    its lines are answers to later questions.
+    """Return whether a line was typed at the terminal; False if the input is not a terminal, since
+    its lines are then answers to later questions.
     """
     if not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
         return False
@@ -295,15 +300,16 @@ def _enter_pressed() -> bool:
 
 
 class PageOperator(Operator):
-    """An operator at a page in the browser, which is served within the context of this object.
+    """An operator who uses a page in the browser, which is served within the context of this
+    object.
 
-    The page listens on the loopback interface, and its address has a random part. A running trial
-    is stopped if the page has sent no request for 3 s, for example because it was closed. At the
-    end of the context, an open page shows whether the evaluation is complete.
+    The server of the page listens on the loopback interface, and the address has a random part. A
+    running trial is stopped if the page has sent no request for 3 s, for example because it was
+    closed. When the context ends, an open page shows whether the evaluation is complete.
 
     Args:
         say: Prints a line with the page's address.
-        port: The port; 0 chooses a free one.
+        port: The port; 0 selects a free port.
     """
 
     def __init__(self, say: Callable[[str], None] = print, port: int = 0) -> None:
@@ -372,7 +378,7 @@ class PageOperator(Operator):
         self._thread.join()
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
-        """Show the scene to set and live pictures, until the page sends an answer."""
+        """Show the instructions for the scene and live pictures, until the page sends an answer."""
         self._enter("scene", trial)
         answer = self._wait(_LOOK_S)
         while answer is None:
@@ -390,7 +396,7 @@ class PageOperator(Operator):
         return self._answer is not None or not self._is_watched()
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
-        """Show the form for the verdict, until the page sends it."""
+        """Show the form for the verdict, until the page sends the verdict."""
         self._enter("verdict", trial, ending)
         answer = self._wait(1.0)
         while answer is None:
@@ -458,7 +464,7 @@ class PageOperator(Operator):
         return FileResponse(path, headers=_HEADERS)
 
     async def _take(self, http: Request) -> Response:
-        """Accept an answer if it belongs to the present trial and question."""
+        """Accept an answer from the page if it belongs to the present trial and question."""
         if not http.headers.get("content-type", "").startswith("application/json"):
             return PlainTextResponse("expected application/json", 415)
 

@@ -2,9 +2,9 @@
 verdict.
 
 Until then, two files replace results.db. The log, `trials.jsonl`, has a line for each attempt at a
-trial, with its verdict. The policy, its checkpoint and its timing are in `trials.hidden.jsonl`,
-which the operator must not open. Each line of the log contains the hash of its hidden line, so
-neither can be changed later without the other.
+trial, with the verdict. The policy, its checkpoint and its timing are in `trials.hidden.jsonl`,
+which the operator must not open. Each line of the log contains the hash of the corresponding hidden
+line, so neither line can be changed later without the other.
 """
 
 from __future__ import annotations
@@ -59,40 +59,40 @@ from vlagents_ray.robot.loop import Robot, opened, robot_factory
 LOG = "trials.jsonl"
 HIDDEN = "trials.hidden.jsonl"
 KEY = "trials.key"
-# The length of a hidden line is a multiple of this number of bytes, so that the size of the file
-# does not reveal the policy.
+# The lengths of hidden lines are padded to multiples of this number of bytes, so that the size of
+# the file does not reveal the policy.
 _BLOCK = 16384
 _KILLED = "the evaluation ended before the verdict"
 
 
 @dataclass(frozen=True, slots=True)
 class LoggedTrial:
-    """An attempt at a trial in the log."""
+    """One attempt at a trial in the log."""
 
     trial: int
     attempt: int
-    at: float  # the time of its end, s since 1970
-    # The fields that the operator may read: outcome, earned, score, note; or `again`, the reason
-    # of a repetition.
+    at: float  # time at which the attempt ended, s since 1970
+    # Fields that the operator may read: outcome, earned, score and note; or `again`, the reason of
+    # a repetition.
     visible: dict[str, Any]
-    hidden: dict[str, Any]  # the fields that reveal the policy
+    hidden: dict[str, Any]  # fields that reveal the policy
 
     @property
     def finished(self) -> bool:
-        """Whether the trial has a result, so that it is not repeated."""
+        """Whether the trial has a result and is not repeated."""
         return "again" not in self.visible
 
 
 class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
-    """The log in one folder, open for one evaluation at a time."""
+    """The log of trials in one folder, open for one evaluation at a time."""
 
     def __init__(self, plan: ResolvedPlan) -> None:
-        """Open the log in `plan.out`, or begin a new one.
+        """Open the log in `plan.out`, or create a new log.
 
         Raises:
-            ConfigError: There is a log and `plan.resume` is off, or the log has another plan or
-                key, or there are results of a simulation, or another evaluation writes to the
-                folder.
+            ConfigError: The folder has a log and `plan.resume` is False, the log belongs to another
+                plan or key, the folder has results of a simulation, or another evaluation is
+                writing to the folder.
             StorageFailed: The folder cannot be written to.
         """
         self._path = plan.out / LOG
@@ -128,15 +128,15 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
 
     @property
     def finished(self) -> dict[int, LoggedTrial]:
-        """The trials that have a result, by their number."""
+        """The trials with a result, by the number of the trial."""
         return {logged.trial: logged for logged in self.attempts if logged.finished}
 
     def of(self, trial: int) -> list[LoggedTrial]:
-        """Return the attempts at the trial of this number, in their order."""
+        """Return the attempts at the trial with this number, in order."""
         return [logged for logged in self.attempts if logged.trial == trial]
 
     def begin(self, trial: int, attempt: int) -> None:
-        """Record that an attempt begins. If no end follows, the evaluation was killed."""
+        """Record that an attempt begins. If no end is recorded, the evaluation was killed."""
         self._write({"trial": trial, "attempt": attempt, "begun": time.time()})
 
     def end(
@@ -152,7 +152,9 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
         self._write({"unblinded": time.time()})
 
     def _read(self, plan: ResolvedPlan, identity: str) -> None:
-        """Read the attempts, or begin the log; `identity` is the hash of the plan's cases."""
+        """Read the attempts from the log, or create the log; `identity` is the hash of the plan's
+        cases.
+        """
         lines = [json.loads(line) for line in self._log.read()]
         hidden_lines = _by_hash(self.key, self._hidden.read())
         if not lines:
@@ -196,7 +198,7 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             if hidden is not None:
                 text = json.dumps(hidden, default=str).encode()
                 text += b" " * (-len(text) % _BLOCK)
-                # The hidden line is written before the line with its hash, since the process may be
+                # Write the hidden line before the line with its hash, since the process may be
                 # killed in between.
                 self._hidden.append(text)
                 line = {**line, "hidden": _hash(self.key, text)}
@@ -222,7 +224,9 @@ class _JsonLines(contextlib.AbstractContextManager["_JsonLines"]):
             ) from error
 
     def read(self) -> list[bytes]:
-        """Return all complete lines, and delete an incomplete one that a killed process left."""
+        """Return all complete lines, and delete an incomplete line, which a killed process may have
+        left.
+        """
         self._file.seek(0)
         data = self._file.read()
         complete = data.rfind(b"\n") + 1
@@ -230,7 +234,7 @@ class _JsonLines(contextlib.AbstractContextManager["_JsonLines"]):
         return data[:complete].splitlines()
 
     def append(self, line: bytes) -> None:
-        """Write a line to the disk."""
+        """Append a line, and flush it to the disk."""
         self._file.write(line + b"\n")
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -244,10 +248,10 @@ def logged_plan(out: Path, key: str | None) -> EvalConfig:
 
     Args:
         out: The folder of an evaluation on a robot.
-        key: The plan's key; None if it is in the folder.
+        key: The plan's key; None reads it from the folder.
 
     Raises:
-        ConfigError: The folder has no log, or its log has another key.
+        ConfigError: The folder has no log, or its log belongs to another key.
     """
     try:
         with (out / LOG).open("rb") as file:
@@ -258,13 +262,13 @@ def logged_plan(out: Path, key: str | None) -> EvalConfig:
         return EvalConfig.model_validate(plan["config"])
     except FileNotFoundError as error:
         raise ConfigError(
-            f"expected the folder of an evaluation on a robot, got one without {error.filename}; "
-            "check the path"
+            f"expected the folder of an evaluation on a robot, got a folder without "
+            f"{error.filename}; check the path"
         ) from error
     except (KeyError, ValueError) as error:
         raise ConfigError(
-            f"{out / LOG}: expected a log that this key opens, got another's; use the `robot.key` "
-            "of its plan"
+            f"{out / LOG}: expected a log of this key, got the log of another key; use the "
+            f"`robot.key` of its plan"
         ) from error
 
 
@@ -278,7 +282,9 @@ def _by_hash(key: bytes, lines: Iterable[bytes]) -> dict[str, bytes]:
 
 
 def _key(plan: ResolvedPlan) -> bytes:
-    """Return the plan's key, or the random key of this folder, which is drawn if there is none."""
+    """Return the plan's key or, if there is none, the random key of this folder, which is created
+    if necessary.
+    """
     robot, _ = plan.cases[0].on_robot
     if robot.key is not None:
         return robot.key.encode()
@@ -292,7 +298,7 @@ def _key(plan: ResolvedPlan) -> bytes:
 
 
 RECORDINGS = "recordings"
-# The messages of these loggers may name a policy.
+# Loggers whose messages may contain the name of a policy.
 _LOGGERS = ("vlagents_ray", "ray", "ray.serve", "websockets", "asyncio")
 
 
@@ -300,7 +306,7 @@ class TrialsInterrupted(KeyboardInterrupt):
     """The operator or a signal ended an evaluation on a robot. `resume` continues with the next
     trial.
 
-    There are no results yet, as they would unblind the remaining trials.
+    No results are written yet, since they would unblind the remaining trials.
     """
 
 
@@ -314,17 +320,17 @@ def evaluate_on_robot(
     """Run every trial of `config` that has no result yet, and write the results to `config.out`.
 
     The order of the policies is random (`schedule`). Until the last verdict, only the hidden file
-    in the folder names the policy of a trial (`TrialLog`); no output and no log does. results.db,
-    summary.json and report.html are written at the end, as for a simulation. With `config.stop`, a
-    task ends once all its cases have stopped, since trials of only the remaining cases would reveal
-    their policies.
+    in the folder (see `TrialLog`) contains the policies of the trials; no output and no log
+    contains them. results.db, summary.json and report.html are written at the end, as for a
+    simulation. With `config.stop`, a task ends only when all its cases have stopped, since trials
+    of only the remaining cases would reveal their policies.
 
     Args:
         config: The policies, with their URLs, and the plan, with `robot`.
         operator: The operator at the robot.
         robot: The robot; by default an object of the class `config.robot.arm`.
-        agent_factory: Called with a policy to make its agent for a trial; by default, the agent is
-            a connection to the policy's `url`.
+        agent_factory: Called with a policy to create the agent for a trial; by default, the agent
+            is a connection to the policy's `url`.
 
     Returns:
         The summary of all results in `config.out`.
@@ -332,7 +338,7 @@ def evaluate_on_robot(
     Raises:
         ConfigError: The settings are invalid or contradict the log in `config.out`, or a policy
             changed between trials.
-        MissingDependency: Trials are to be recorded, and the extra "record" is not installed.
+        MissingDependency: The settings request recordings, and the extra "record" is not installed.
         StorageFailed: The disk is full, or cannot be written to.
         TrialsInterrupted: The operator ended the evaluation, or Ctrl-C did.
         VLAgentsError: A policy cannot be reached, or fails, before the first trial.
@@ -348,20 +354,20 @@ def play_trials(
     robot: Robot | None = None,
     agent_factory: AgentFactory | None = None,
 ) -> Summary:
-    """Evaluate as `evaluate_on_robot` does, by a plan that is already resolved.
+    """Evaluate like `evaluate_on_robot`, with a plan that is already resolved.
 
     Args:
         plan: The plan, whose configuration passes `require_trials`.
         operator: The operator at the robot.
-        robot: The robot; by default one of the class `config.robot.arm`.
-        agent_factory: Called with a policy to make its agent for a trial, in place of a connection
-            to its `url`.
+        robot: The robot; by default an object of the class `config.robot.arm`.
+        agent_factory: Called with a policy to create the agent for a trial; by default, the agent
+            is a connection to the policy's `url`.
 
     Returns:
         The summary of all results in the plan's folder.
 
     Raises:
-        VLAgentsError: As for `evaluate_on_robot`.
+        VLAgentsError: As in `evaluate_on_robot`.
         TrialsInterrupted: The operator ended the evaluation, or Ctrl-C did.
     """
     if plan.record != "none":
@@ -388,17 +394,17 @@ def play_trials(
 
 
 def unblind(out: Path, key: str | None = None) -> Summary:
-    """Write the results of the trials judged so far; later trials are not blind.
+    """Write the results of the trials judged so far; all later trials are no longer blind.
 
     Args:
         out: The folder of an evaluation on a robot.
-        key: The plan's key; None if it is in the folder.
+        key: The plan's key; None reads it from the folder.
 
     Returns:
         The summary of these results.
 
     Raises:
-        ConfigError: The folder has no trials, or its log has another key.
+        ConfigError: The folder has no trials, or its log belongs to another key.
     """
     config = logged_plan(out, key).model_copy(update={"out": out, "resume": True})
     require_trials(config)
@@ -431,7 +437,7 @@ def require_trials(config: EvalConfig) -> None:
 
 @dataclasses.dataclass(slots=True)
 class _RemainingTrials:
-    """Runs the remaining trials in turn."""
+    """Runs the remaining trials one after another."""
 
     _plan: ResolvedPlan
     _operator: Operator
@@ -439,7 +445,7 @@ class _RemainingTrials:
     _factory: AgentFactory
     _log: TrialLog
     _trials: Sequence[Trial]
-    _message: str = ""  # for the operator, about the last trial
+    _message: str = ""  # note about the last trial, for the operator
     _stopping: EarlyStopping = dataclasses.field(init=False)
     # The fingerprints of the cases of each task.
     _cases_of_task: dict[tuple[str, str], set[str]] = dataclasses.field(default_factory=dict)
@@ -460,15 +466,16 @@ class _RemainingTrials:
 
         obs = self._robot.observe()
         case_of_policy = {trial.job.case.policy_id: trial.job.case for trial in remaining}
-        # The order of the names reveals nothing about the order of the trials.
+        # Sort by name, since this order reveals nothing about the order of the trials.
         for policy_id in sorted(case_of_policy):
             case = case_of_policy[policy_id]
             try:
                 rehearse(case, self._robot, self._factory, self._operator, obs)
             except ContractMismatch as error:
                 raise ContractMismatch(
-                    "a policy of this plan does not fit the robot. It is not named here, as the "
-                    f"trials are blind; `vlagents-ray robot URL --robot {case.on_robot[0].arm}` "
+                    f"a policy of this plan does not fit the robot. This message does not name the "
+                    f"policy, as the trials are blind; `vlagents-ray robot URL --robot "
+                    f"{case.on_robot[0].arm}` "
                     "compares one policy with the robot, before any motion.\n"
                     f"{error}"
                 ) from None
@@ -480,11 +487,11 @@ class _RemainingTrials:
                 self._play(trial)
 
     def _is_due(self, trial: Trial) -> bool:
-        """Return whether the trial has no result and its task is not over."""
+        """Return whether a trial has no result and its task is not over."""
         return trial.number not in self._log.finished and not self._is_over(trial)
 
     def _play(self, trial: Trial) -> None:
-        """Run one attempt at the trial, and record its verdict or the reason of its repetition."""
+        """Run one attempt at a trial, and record the verdict or the reason of a repetition."""
         view = self._visible(trial)
         attempt = view.attempt
         if not self._operator.prepare(view, self._robot.observe):
@@ -525,7 +532,8 @@ class _RemainingTrials:
             self._log.end(trial.number, attempt, {"again": verdict.note, "cause": "operator"}, {})
             return
 
-        # A partial success counts as a failure in success rates; its score is stored as the return.
+        # A partial success counts as a failure in the success rates; the score is stored as the
+        # return.
         success = verdict.outcome == "success"
         result = dataclasses.replace(
             played.result,
@@ -603,8 +611,8 @@ class _RemainingTrials:
 
 
 def _changed_weights(earlier: dict[str, Any], result: EpisodeResult) -> str | None:
-    """Return "checkpoint" or "weights", the first of them that differs between two results; None
-    if neither does.
+    """Return "checkpoint" if the checkpoints of two results differ, otherwise "weights" if the
+    weights differ, otherwise None.
 
     Args:
         earlier: The fields of the earlier result.
@@ -621,21 +629,21 @@ def result_of(trial: Trial, logged: LoggedTrial) -> EpisodeResult:
     """Return the result of a finished trial from the log.
 
     Raises:
-        ConfigError: The logged result belongs to another plan.
+        ConfigError: The result in the log belongs to another plan.
     """
     fields = dict(logged.hidden["result"])
     fields["key"] = EpisodeKey(**fields["key"])
     if fields["key"] != trial.job.key:
         raise ConfigError(
-            f"trial {trial.number}: expected a result of this plan, got another plan's; choose "
-            "another out folder"
+            f"trial {trial.number}: expected a result of this plan, got a result of another plan; "
+            f"choose another out folder"
         )
     return EpisodeResult(**fields)
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Return a context manager that silences the loggers of this package and of Ray, as their
+    """Return a context manager that silences the loggers of this package and of Ray, since their
     messages may name the policy.
     """
     loggers = {name: logging.getLogger(name) for name in _LOGGERS}
@@ -650,8 +658,8 @@ def _quiet() -> Iterator[None]:
 
 
 def _write_results(plan: ResolvedPlan, log: TrialLog, state: str) -> Summary:
-    """Write results.db from the whole log, as an evaluation in simulation would, and replace an
-    earlier one.
+    """Write results.db from the whole log, in the form of an evaluation in simulation, and replace
+    an earlier file.
     """
     trials = schedule(plan.cases, log.key)
     with storing(plan.out):

@@ -1,4 +1,6 @@
-"""The trials of an evaluation on a robot: their order, and how one trial runs."""
+"""The trials of an evaluation on a robot: the order of the trials, and the execution of one
+trial.
+"""
 
 from __future__ import annotations
 
@@ -43,15 +45,15 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.wrapper import RobotWrapper
 
 _STOPPED = "stopped by the operator"
-_WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer
+_WAIT_S = 1.0  # deadline of a tick, s, in the modes that wait for an answer
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A trial, with its policy, `job.case.policy`, which the operator must not see."""
+    """A trial. The operator must not see its policy, `job.case.policy`."""
 
-    number: int  # from 1, in the order in which the trials run
-    scene: int  # from 1; each policy has one trial in each scene of a task
+    number: int  # number of the trial, from 1, in the order in which the trials run
+    scene: int  # number of the scene, from 1; each policy has one trial in each scene of a task
     job: Job
 
     @property
@@ -70,16 +72,16 @@ def schedule(cases: Iterable[EvalCase], key: bytes) -> list[Trial]:
     once.
 
     With k policies, each group of k consecutive scenes of a task has the rows of a k x k Latin
-    square. The order of its rows and that of the policies in its columns are random. The fewer than
-    k scenes that remain of each task share one more square: they take the rows that the remaining
-    scenes of earlier tasks used least often, and a random one of equals. So each policy is first,
-    second, and so on equally often. The counts differ by at most one in each task, and in the whole
-    plan. A group may span several seeds. The order depends on the key and on the names of policies,
-    suites and environments, through HMAC-SHA256.
+    square. The order of the rows and the order of the policies in the columns are random. In each
+    task, fewer than k scenes may remain. The remaining scenes of all tasks share one more square:
+    each uses a row that earlier remaining scenes used least often, chosen at random among equals.
+    So each policy is first, second, and so on equally often: the counts differ by at most one in
+    each task, and in the whole plan. A group may span several seeds. The order depends on the key
+    and on the names of policies, suites and environments, through HMAC-SHA256.
 
     Args:
-        cases: The cases of the plan, all on a robot.
-        key: The plan's key, which reveals the policy of each trial.
+        cases: The cases of the plan, which all run on a robot.
+        key: The plan's key, with which the policy of each trial can be computed.
 
     Returns:
         The trials in the order in which they run.
@@ -110,8 +112,8 @@ def _orders(
     """Yield the order of the policies in each scene of a task.
 
     Args:
-        rows_used: How often the remaining scenes of earlier tasks used each row of their common
-            square. It is updated.
+        rows_used: How often the remaining scenes of earlier tasks used each row of the shared
+            square; this function updates the counts.
     """
     size = len(names)
     for first in range(0, scenes, size):
@@ -129,8 +131,8 @@ def _orders(
 
 
 def _drawn(key: bytes, purpose: list[str | int], names: Iterable[str]) -> list[str]:
-    """Return the names in the order of their authentication codes, which does not depend on the
-    order in the plan. `purpose` makes the draws differ.
+    """Return the names in the order of their authentication codes, which is independent of the
+    order in the plan. Each `purpose` gives another order.
     """
 
     def code(name: str) -> bytes:
@@ -141,18 +143,19 @@ def _drawn(key: bytes, purpose: list[str | int], names: Iterable[str]) -> list[s
 
 @dataclass(frozen=True, slots=True)
 class PlayedTrial:
-    """A trial that has ended, before its verdict."""
+    """A trial that has ended, but has no verdict yet."""
 
-    result: EpisodeResult  # its success is not set yet
+    result: EpisodeResult  # the result, whose success is not set yet
     metadata: dict[str, Any]  # the metadata of the policy's server
-    ending: str  # how it ended, in words that do not depend on the policy
+    ending: str  # how the trial ended, in words that do not depend on the policy
 
 
 class WatchedRobot(RobotWrapper):
-    """A robot whose errors become `EnvFailed`, and whose steps are counted."""
+    """A wrapper that converts the errors of a robot to `EnvFailed`, and counts the steps."""
 
     stats: EpisodeStats | None = None  # the statistics of the running trial
-    # Whether the player has returned the next action; the way to the rest pose has no steps.
+    # Whether the player has returned the next action; motions to the rest pose do not count as
+    # steps.
     step_due: bool = False
 
     def observe(self) -> Obs:
@@ -160,7 +163,7 @@ class WatchedRobot(RobotWrapper):
             return super().observe()
 
     def apply(self, action: np.ndarray) -> None:
-        """Command an action, and count it as a step of the running trial if it is one."""
+        """Command an action, and count it if it is a step of the running trial."""
         with env_side("robot, apply"):
             super().apply(action)
         if self.stats is not None and self.step_due:
@@ -183,7 +186,7 @@ class _OperatorStop(CommandInbox):
         self._operator = operator
 
     def apply(self, control: RobotControl) -> list[Command]:
-        """Stop the robot if the operator stops the trial."""
+        """Set the stop if the operator stops the trial."""
         if self._operator.stops() and not control.stopped:
             control.stop(_STOPPED)
         return super().apply(control)
@@ -236,17 +239,17 @@ def play(
     operator: Operator,
     recording: Path | None,
 ) -> PlayedTrial:
-    """Run one attempt at a trial, and always stop the robot at its end.
+    """Run one attempt at a trial, and always stop the robot at the end.
 
     Args:
         trial: The trial.
         robot: The robot.
-        factory: Makes the agent of the trial's policy.
+        factory: Creates the agent of the trial's policy.
         operator: The operator, who may stop the trial.
         recording: The folder for a recording; None for no recording.
 
     Returns:
-        The trial, with the status "policy_error" if the policy failed.
+        The ended trial; its status is "policy_error" if the policy failed.
 
     Raises:
         CheckpointFailed: The policy cannot load its checkpoint.
@@ -281,8 +284,8 @@ def play(
             options = LoopOptions(
                 restart="manual",
                 commands=_OperatorStop(operator),
-                # The rehearsal has compared the numbers with the training; in a trial, the policy's
-                # behaviour is its result.
+                # The rehearsal has already compared the numbers with the training data; in a trial,
+                # the policy's behaviour must become the result.
                 fit=fit_of(player, robot, trained=Trained()),
                 reset_options={**case.policy_options, "env": case.env, "seed": trial.job.key.seed},
                 report=report,
@@ -312,8 +315,8 @@ def play(
         stats.timeliness = report.timeliness
         result = replace(stats.result(transport_of(agent), failed), env_seconds=None)
 
-        # The text does not contain whether the policy considered the task finished, as only some
-        # policies ever do.
+        # The text does not mention whether the policy reported the task as finished, since only
+        # some policies ever do.
         if failed is not None:
             ending = "the policy failed"
         else:
@@ -340,9 +343,9 @@ def rehearse(
 ) -> None:
     """Run a policy once, without moving the robot.
 
-    Mistakes in the settings, and policies that do not fit the robot, are thus found before the
-    first trial. Work of a first call, such as compilation, does not slow the first trial, where it
-    would reveal which policy is running.
+    The rehearsal detects mistakes in the settings, and policies that do not fit the robot, before
+    the first trial. It also performs the slow work of a first call, such as compilation, which
+    would reveal the policy if it slowed the first trial.
     """
     settings, task = case.on_robot
     unused = EpisodeStats(EpisodeKey(case.env, 0, 0, case.fingerprint))
@@ -357,7 +360,8 @@ def rehearse(
                 agent.reset(obs, task.instruction, **case.policy_options)
                 fit.require(None, agent.act(obs).rows())
 
-        with contextlib.suppress(InvalidAction):  # in a trial, it counts as the policy's failure
+        # In a trial, this error counts as the policy's failure.
+        with contextlib.suppress(InvalidAction):
             player.reset(obs, task.instruction, **case.policy_options)
             player.act(obs)
 
@@ -370,7 +374,7 @@ def _player(
     robot: WatchedRobot,
     operator: Operator,
 ) -> Iterator[tuple[Agent, ChunkPlayer]]:
-    """Return a context manager that yields a policy's agent and its player with the plan's
+    """Return a context manager that yields a policy's agent and its chunk player with the plan's
     settings, and closes both.
     """
     settings, _ = case.on_robot
@@ -392,10 +396,10 @@ def _player(
             measure=measured_state(settings.measure),
             limits=settings.limits,
             hz=settings.hz,
-            soft_start_s=0.0,  # so that all trials of all policies have the same limits
+            soft_start_s=0.0,  # all trials of all policies then have the same limits
         )
         player = _CountingPlayer(agent, stats, robot, operator, player_settings, check=guard)
-        unplayed.pop_all()  # the player closes the agent
+        unplayed.pop_all()  # closing the player closes the agent
 
     with player:
         yield agent, player

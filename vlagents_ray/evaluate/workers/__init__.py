@@ -1,1 +1,1 @@
-"""The rollout workers: Ray actors that run episodes."""
+"""The workers that run episodes, in Ray actors or in this process."""

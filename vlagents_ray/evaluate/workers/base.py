@@ -1,4 +1,4 @@
-"""The workers that run episodes: their interface, and the state of one."""
+"""The interface of the workers that run episodes, and the state of a worker."""
 
 from __future__ import annotations
 
@@ -17,33 +17,34 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report
 
-SIGNAL_S = 0.2  # the time by which a signal may reach this process later than a worker, s
+SIGNAL_S = 0.2  # maximum delay, s, with which a signal reaches this process after a worker
 
 
 @dataclass(slots=True, eq=False)
 class WorkerHandle:
-    """A worker of the pool. Times are those of `time.monotonic()`."""
+    """A worker of the pool. Times are values of `time.monotonic()`."""
 
     config: WorkerConfig
     kind: str  # identifies `config`
     actor: Any
     starting: Any  # ObjectRef of `ready()`; None once the worker runs
-    started_at: float  # time of its start
-    jobs: tuple[Job, ...] = ()  # the jobs that it runs, all of one case
+    started_at: float  # time at which the worker was started
+    jobs: tuple[Job, ...] = ()  # the jobs that the worker runs, all of one case
     running: Any = None  # ObjectRef of `run(jobs)`
-    env_place: str | None = None  # the place of its environment
+    env_place: str | None = None  # the place of the worker's environment
     query: Any = None  # ObjectRef of `progress()`
     queried_at: float = 0.0  # time of the last query
     heartbeat: Heartbeat = field(default_factory=lambda: Heartbeat("idle", 0.0, 0))
     heartbeat_at: float = 0.0  # time of the last answer
-    process: dict[str, Any] = field(default_factory=dict)  # the answer of `ready()`
-    # Ray's id of the node it runs on or, while it starts, is requested on; None: any node.
+    process: dict[str, Any] = field(default_factory=dict)  # the result of `ready()`
+    # Ray's id of the node on which the worker runs or, while it starts, is requested; None: any
+    # node.
     node: str | None = None
 
 
 class Workers(contextlib.AbstractContextManager["Workers"]):
-    """The workers of an evaluation, wherever they run. Use it as a context manager, whose end
-    ends them.
+    """The workers of an evaluation. Use it as a context manager; the workers end when the context
+    ends.
     """
 
     def __init__(
@@ -52,12 +53,12 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         agent_factory: AgentFactory,
         recorders: RecorderFactory | None = None,
     ) -> None:
-        """Prepare workers, which start when there are jobs for them.
+        """Prepare workers; each worker starts when there are jobs for it.
 
         Args:
             plan: The plan of the jobs.
-            agent_factory: Makes a worker's agent of a policy.
-            recorders: Makes the recorder of an episode; None: of the plan's videos and
+            agent_factory: Creates a worker's agent for a policy.
+            recorders: Creates the recorder of an episode; None: recorders of the plan's videos and
                 trajectories.
         """
         self._plan = plan
@@ -73,8 +74,8 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         return any(worker.jobs for worker in self._workers)
 
     def kinds(self, *, occupied: bool = True) -> Counter[str]:
-        """Return the number of workers by kind; with `occupied` False, of those without jobs,
-        which may be starting.
+        """Return the number of workers by kind. With `occupied` False, count only workers without
+        jobs, which may still be starting.
         """
         return Counter(worker.kind for worker in self._workers if occupied or not worker.jobs)
 
@@ -83,12 +84,12 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         return Counter(worker.jobs[0].case.place for worker in self._workers if worker.jobs)
 
     def idle(self) -> list[WorkerHandle]:
-        """Return the workers that can take a job."""
+        """Return the workers that can run a job."""
         return [worker for worker in self._workers if worker.starting is None and not worker.jobs]
 
     @abstractmethod
     def free_slot(self) -> bool:
-        """Return whether one more worker may start; ends an idle one if there is no room."""
+        """Return whether one more worker may start; if there is no room, end an idle worker."""
 
     @abstractmethod
     def start(self, case: EvalCase) -> None:
@@ -100,7 +101,9 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     @abstractmethod
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
-        """Yield the reports that arrive within `timeout_s`, also of workers that broke."""
+        """Yield the reports that arrive within `timeout_s`, including the reports about workers
+        that broke.
+        """
 
     @abstractmethod
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The Ray cluster of an evaluation: resources, placement and logs of its workers."""
+"""The Ray cluster of an evaluation: resources, placement and logs of the workers."""
 
 from __future__ import annotations
 
@@ -30,51 +30,53 @@ from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.ray_tools.session import joined
 
 log = logging.getLogger(__name__)
-MOST_BYTES = 64_000  # most bytes of a kept log, all files together
-TIMEOUT_S = 5.0  # s for another node to read it
+MOST_BYTES = 64_000  # maximum total size of a kept log, bytes
+TIMEOUT_S = 5.0  # s, time limit for reading a log on another node
 
 
 @contextmanager
 def ray_cluster(plan: ResolvedPlan) -> Iterator[None]:
-    """Join the cluster that `RAY_ADDRESS` names or start a local one, unless this process is in
-    one; leave it after.
+    """Join the cluster at `RAY_ADDRESS` or start a local cluster, unless this process is in a
+    cluster; leave the cluster when the context ends.
     """
     with ExitStack() as stack:
         if os.environ.get("RAY_ADDRESS"):
             stack.enter_context(joined())
         else:
-            # CPUs are logical: the user's number of workers must fit.
+            # The number of CPUs is logical: the user's number of workers must fit.
             needed_cpus = ceil(max(1, plan.workers) * most_cpus(plan.cases))
             cpus = max(os.cpu_count() or 1, needed_cpus)
-            with withheld():  # workers get the key when they are ready; Ray's daemons need none
+            # Workers receive the API key when they are ready; Ray's daemons must not have it.
+            with withheld():
                 stack.enter_context(joined("local", num_cpus=cpus))
         yield
 
 
 def most_cpus(cases: Iterable[EvalCase]) -> float:
-    """Return the largest number of CPUs that the worker of any case requests; a share of one may
-    be requested.
+    """Return the largest number of CPUs that a worker of any case requests; it may be a
+    fraction.
     """
     return max(case.worker.cpus for case in cases)
 
 
 def most_gpus(cases: Iterable[EvalCase]) -> float:
-    """Return the largest number of GPUs that the worker of any case requests; a share of one may
-    be requested.
+    """Return the largest number of GPUs that a worker of any case requests; it may be a
+    fraction.
     """
     return max(case.worker.gpus for case in cases)
 
 
 def runtime_env(case: EvalCase) -> dict[str, Any]:
-    """Return Ray's runtime environment of a worker: its thread settings, and no GPUs if it requests
-    none.
+    """Return Ray's runtime environment of a worker: the thread settings, and no visible GPUs if the
+    worker requests none.
 
-    No secret may be in it: Ray writes runtime environments to logs that every user of a machine can
-    read.
+    It must not contain secrets: Ray writes runtime environments to logs that every user of a
+    machine can read.
     """
     configured: dict[str, Any] = dict(case.worker.runtime_env)
     variables = dict.fromkeys(THREAD_VARIABLES, str(case.worker.threads))
-    # Ray does not hide GPUs from an actor that requests none. A policy in the worker may need them.
+    # Ray does not hide GPUs from an actor that requests no GPU, so hide them here. But a policy in
+    # the worker may need the GPUs.
     is_served = bool(case.policy.url or case.policy.source)
     if not case.worker.gpus and is_served:
         variables[GPUS] = ""
@@ -82,32 +84,35 @@ def runtime_env(case: EvalCase) -> dict[str, Any]:
 
 
 def unused_gpus(case: EvalCase, worker: WorkerInfo) -> str | None:
-    """Return a warning that the workers of `case` render in software in a cluster with GPUs;
-    None if they do not.
+    """Return a warning if the workers of `case` render in software although the cluster has GPUs;
+    otherwise None.
     """
     gpus = 0 if case.worker.gpus else ray.cluster_resources().get("GPU", 0)
     if not gpus:
         return None
     return (
-        f"{case.env} draws on {worker.renderer}, as its workers have no GPU; the cluster has "
+        f"{case.env} renders on {worker.renderer}, as its workers have no GPU; the cluster has "
         f"{gpus:g}: {SHARE}, see docs/cluster/scaling.md"
     )
 
 
 class Placement:
-    """Chooses the node of a worker: that of its replica, as long as there is room.
+    """Chooses the node of a worker: a node with a replica of its policy, as long as there is
+    room.
 
-    Only the replicas of policies that this cluster serves are known, `serve://APP`.
+    Replicas are known only for policies that this cluster serves, at `serve://APP`.
     """
 
     def __init__(self) -> None:
-        self._replicas: dict[str, ReplicaNodes] = {}  # nodes of the replicas, by application
+        # Number of replicas on each node, by application.
+        self._replicas: dict[str, ReplicaNodes] = {}
 
     def node(self, url: str | None, workers: Mapping[str | None, int]) -> str | None:
         """Return Ray's id of the node for one more worker of the policy at `url`; None for any
         node.
 
-        `workers` is the number of workers on each node: nodes with many replicas get many.
+        `workers` contains the number of workers on each node: nodes with more replicas get more
+        workers.
         """
         parts = urlsplit(url or "")
         if parts.scheme != "serve":
@@ -117,15 +122,15 @@ class Placement:
 
 
 def fewest(replicas: Mapping[str, int], workers: Mapping[str | None, int]) -> str | None:
-    """Return the node with the fewest workers for each replica after one more is placed there;
-    the first of equals.
+    """Return the node that would have the fewest workers per replica after one more worker; among
+    equal nodes, the first.
     """
     return min(replicas, key=lambda node: (workers.get(node, 0) + 1) / replicas[node], default=None)
 
 
 def strategy(node: str | None) -> Any:
-    """Return Ray's scheduling strategy for a worker on `node`, or on another node if that one is
-    full or gone.
+    """Return Ray's scheduling strategy for a worker on `node`, or on another node if `node` is full
+    or gone.
     """
     if node is None:
         return "SPREAD"
@@ -136,30 +141,30 @@ class CapacityMonitor:
     """Decides whether an evaluation continues while the cluster has no room for some of its
     workers.
 
-    It continues as long as other workers run: a worker's node may have been lost, and may
-    return.
+    The evaluation continues as long as other workers run: the node of a missing worker may have
+    been lost, and may return.
     """
 
     def __init__(self, workers: int, place_s: float, now: Callable[[], float] = monotonic) -> None:
-        """Begin to watch.
+        """Create the monitor.
 
         Args:
             workers: The number of workers of the plan.
-            place_s: The time until the cluster has resources for a worker, s.
+            place_s: The time limit until the cluster has resources for a worker, s.
             now: A clock, in s.
         """
         self._workers = workers
         self._place_s = place_s
         self._now = now
         self._last_played = now()  # time at which an episode last ran
-        self._warned = False  # whether the user was warned that there is no room for all
+        self._warned = False  # whether the user was warned that there is no room for all workers
 
     def note_playing(self) -> None:
-        """Note that an episode runs."""
+        """Record that an episode runs."""
         self._last_played = self._now()
 
     def note_started(self) -> None:
-        """Note that a worker has started, so that a later shortage is reported again."""
+        """Record that a worker has started, so that a later shortage is reported again."""
         self._warned = False
 
     def timed_out(self, since: float) -> bool:
@@ -167,7 +172,7 @@ class CapacityMonitor:
         return self._now() - since > self._place_s
 
     def report_shortage(self, worker: WorkerConfig, running: int) -> None:
-        """Warn that a worker has waited too long while `running` run.
+        """Warn that a worker has waited too long while `running` workers run.
 
         Raises `ConfigError` if no episode runs either.
         """
@@ -183,11 +188,11 @@ class CapacityMonitor:
         )
         if idle_too_long:
             raise ConfigError(message)
-        log.warning("going on with %d of %d workers: %s", running, self._workers, message)
+        log.warning("continuing with %d of %d workers: %s", running, self._workers, message)
 
 
 def tail(paths: Sequence[str]) -> str:
-    """Return the end of each file under its name, except of missing files."""
+    """Return the end of each existing file, below the name of the file."""
     ends = []
     for path in paths:
         with contextlib.suppress(OSError), open(path, "rb") as file:
@@ -199,7 +204,7 @@ def tail(paths: Sequence[str]) -> str:
 
 
 def tail_at(host: str, paths: Sequence[str]) -> str:
-    """Return `tail` of files on any host of the cluster; "" if the host is lost."""
+    """Return `tail` of files on another host of the cluster; "" if the host is lost."""
     if host == socket.gethostname():
         return tail(paths)
 
@@ -216,5 +221,5 @@ def tail_at(host: str, paths: Sequence[str]) -> str:
         return str(ray.get(read.remote(list(paths)), timeout=TIMEOUT_S))
     except GetTimeoutError:
         raise TimeoutError(f"host {host} did not answer within {TIMEOUT_S:g} s") from None
-    except RayError:  # the node is gone with its files
+    except RayError:  # the node is gone, with its files
         return ""

@@ -1,4 +1,6 @@
-"""Workers without Ray: one, in this process; and the choice between it and Ray actors."""
+"""A single worker in this process, without Ray, and the choice between this worker and Ray
+actors.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +25,17 @@ from vlagents_ray.ray_tools.signals import is_stopping, raised_at_once
 log = logging.getLogger(__name__)
 
 
-_LOOK_S = 1.0  # the time between two looks at the phase
-_STACK_LINES = 6  # the innermost three calls
-_CLOSE_S = 5.0  # time to close the agent and the environment after a signal, s
+_LOOK_S = 1.0  # s, time between two checks of the phase
+_STACK_LINES = 6  # shown lines of the stack: the innermost three calls
+_CLOSE_S = 5.0  # s, time limit for closing the agent and the environment after a signal
 
 
 class InProcessWorkers(Workers):
-    """One worker, which runs its episodes in `wait`.
+    """A single worker, which runs its episodes in `wait`.
 
-    A call that hangs is reported, but no time limit can end it. A signal ends it, with
-    `KeyboardInterrupt`: the thread that runs the episodes is the one that would read the flag
-    of `stop_signals`.
+    A hanging call is reported, but no time limit can end it. A signal ends the call by raising
+    `KeyboardInterrupt`, since this thread runs the episodes and cannot check the flag of
+    `stop_signals` meanwhile.
     """
 
     def __init__(
@@ -57,13 +59,15 @@ class InProcessWorkers(Workers):
             self._variables.close()
 
     def free_slot(self) -> bool:
-        """Remove the worker if it is idle; return whether there is none."""
+        """Remove the worker if it is idle; return whether there is no worker."""
         for worker in self.idle():
             self._workers.remove(worker)
         return not self._workers
 
     def start(self, case: EvalCase) -> None:
-        """Begin the worker of a case, and set its environment variables in this process."""
+        """Start the worker for a case, and set the worker's environment variables in this
+        process.
+        """
         self._variables.enter_context(variables(case.worker.runtime_env.get(VARIABLES) or {}))  # type: ignore[arg-type]
         self._workers.append(
             WorkerHandle(case.worker, case.kind, actor=None, starting=self, started_at=0.0)
@@ -73,7 +77,7 @@ class InProcessWorkers(Workers):
         worker.jobs = jobs
 
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
-        """Play the dispatched jobs, and yield their reports; the time is not limited."""
+        """Run the dispatched jobs, and yield their reports; the time is not limited."""
         for worker in self._workers:
             worker.starting = None
             jobs, worker.jobs = worker.jobs, ()
@@ -93,7 +97,7 @@ class InProcessWorkers(Workers):
             yield from zip(jobs, reports, strict=True)
 
     def close(self) -> None:
-        """Close the agent and the environment; the next jobs begin with new ones."""
+        """Close the agent and the environment; the next jobs create new ones."""
         rollout = self._rollout
         self._rollout = Rollout(self._agent_factory, self._recorders)
         try:
@@ -105,16 +109,16 @@ class InProcessWorkers(Workers):
 
 @contextlib.contextmanager
 def _exits_raised() -> Iterator[None]:
-    """Let `os._exit`, called by a policy or a simulator in this thread, raise `PolicyFailed`.
+    """Make `os._exit` raise `PolicyFailed` if a policy or a simulator calls it in this thread.
 
-    The call would otherwise end the command without a message, and possibly with status 0.
+    Otherwise the call would end the command without a message, and possibly with status 0.
     """
     end_process = os._exit
     player = (os.getpid(), threading.get_ident())
 
     def end(status: int) -> NoReturn:
-        """Raise an error in this thread; end the process in any other."""
-        # A child of this process, or Ray's watcher in another thread, may end its process.
+        """Raise an error in this thread; end the process in any other thread."""
+        # A child process, or the thread that watches Ray, may end the process.
         if (os.getpid(), threading.get_ident()) != player:
             end_process(status)
         caller = sys._getframe(1)
@@ -130,13 +134,13 @@ def _exits_raised() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _hangs_reported(rollout: Rollout, limits: TimeLimits) -> Iterator[None]:
-    """Log the line at which a phase of an episode has exceeded its time limit, once for each
+    """Log the present line of a phase of an episode that has exceeded its time limit, once for each
     such phase.
     """
     ended = threading.Event()
 
     def watch() -> None:
-        """Query the phase until the episode has ended."""
+        """Check the phase periodically until the episode has ended."""
         reported = ("", -1)
         while not ended.wait(_LOOK_S):
             heartbeat = rollout.progress()
@@ -161,8 +165,8 @@ def _hangs_reported(rollout: Rollout, limits: TimeLimits) -> Iterator[None]:
 
 
 def workers_class(plan: ResolvedPlan, stack: contextlib.ExitStack) -> Callable[..., Workers]:
-    """Return the class of the workers: without Ray if the plan has none, else in a cluster that
-    `stack` leaves.
+    """Return the class of the workers: without Ray if the plan has 0 workers, otherwise Ray actors
+    in a cluster that `stack` leaves at its end.
     """
     if plan.workers == 0:
         return InProcessWorkers

@@ -1,4 +1,4 @@
-"""Workers that are Ray actors, which are killed if they hang."""
+"""Workers that are Ray actors; they are killed if they hang."""
 
 from __future__ import annotations
 
@@ -33,23 +33,27 @@ from vlagents_ray.evaluate.workers.cluster import (
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
 from vlagents_ray.ray_tools.head_monitor import HeadMonitor, head_is_gone
 
-WATCH_S = 1.0  # the time between two queries of a busy worker, unless there are many workers
-QUERIES_PER_S = 250  # of all workers, at most: each takes the driver up to 1 ms
-GRACE_S = 5.0  # the time that a call past its deadline has to fail by itself
-KILL_S = 3.0  # the time that Ray has to register that workers are to be killed
-CLOSE_S = 10.0  # the time that workers have to close their simulators when they end
-MOST_FAILED_STARTS = 3  # in a row; workers that fail together, as with their node, count as one
-# The time without further requests to a host that did not return a lost worker's logs.
+WATCH_S = 1.0  # time between two queries of a busy worker, s, unless there are many workers
+# Maximum number of queries per second to all workers: each takes up to 1 ms of the driver's time.
+QUERIES_PER_S = 250
+GRACE_S = 5.0  # s, time after the deadline in which a call can still fail by itself
+KILL_S = 3.0  # s, time limit for Ray to accept the requests to kill workers
+CLOSE_S = 10.0  # s, time limit for workers to close their simulators when they end
+# Maximum number of consecutive failed starts; workers that fail together, e.g. with their node,
+# count as one.
+MOST_FAILED_STARTS = 3
+# Time, s, without further requests to a host that did not return a lost worker's logs.
 UNREACHABLE_S = 60.0
 
 log = logging.getLogger(__name__)
 
 
 class WorkerPool(Workers):
-    """As many workers as the plan has. Use it as a context manager: its end kills every worker.
+    """The workers of a plan, as Ray actors. Use it as a context manager; when the context ends,
+    every worker is killed.
 
-    While the head of the cluster does not answer, the existing workers continue, and no others are
-    started.
+    While the head of the cluster does not answer, the existing workers continue, and no new workers
+    are started.
     """
 
     def __init__(
@@ -60,27 +64,29 @@ class WorkerPool(Workers):
     ) -> None:
         super().__init__(plan, agent_factory, recorders)
         self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
-        # The API key of this process's environment, which workers on other nodes do not inherit.
+        # The API key from this process's environment, which workers on other nodes do not inherit.
         self._credentials = Credentials()
         self._head = HeadMonitor(
             "finished episodes are kept: continue with --resume when a cluster is running again"
         )
         self._placement = Placement()
-        self._failed_starts = 0  # in a row
-        self._last_failed_start = 0.0  # its time
-        # The time until which no request is sent to a host that did not answer.
+        self._failed_starts = 0  # number of consecutive failed starts
+        self._last_failed_start = 0.0  # time of the last failed start
+        # Time until which no request is sent to a host that did not answer, by host.
         self._unreachable: dict[str, float] = {}
         self._limits = plan.limits
         self._capacity = CapacityMonitor(plan.workers, plan.limits.place_s)
-        self._leaving: list[tuple[Any, float]] = []  # actors that are ending, and since when
+        # Actors that are ending, and the times at which their end began.
+        self._leaving: list[tuple[Any, float]] = []
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is ClusterLost:  # nothing can kill them; Ray ends them when the head is lost
+        # Without the head, actors cannot be killed; Ray ends them when the head is lost.
+        if kind is ClusterLost:
             return
         actors = [worker.actor for worker in self._workers]
         actors += [actor for actor, _ in self._leaving]
-        # A Ray cluster that is being stopped, for instance with its job, does not answer; the
-        # results must still be kept, so that this thread does not wait for it.
+        # A Ray cluster that is being stopped, e.g. with its job, does not answer. Kill the actors
+        # in another thread, so that this thread can still save the results.
         killing = threading.Thread(target=_kill, args=(actors,), daemon=True)
         killing.start()
         killing.join(KILL_S)
@@ -88,7 +94,7 @@ class WorkerPool(Workers):
         self._leaving.clear()
 
     def free_slot(self) -> bool:
-        """Return whether a worker can be started, after ending an idle one if that is needed."""
+        """Return whether a worker can be started, after ending an idle worker if necessary."""
         if not self._head.answers():
             return False
         if len(self._workers) < max(1, self._plan.workers):
@@ -99,13 +105,14 @@ class WorkerPool(Workers):
 
         worker = idle[0]
         self._workers.remove(worker)
-        worker.actor.close.remote()  # frees its simulator; some need that for a clean exit
+        # Closes the simulator, which some simulators need for a clean exit.
+        worker.actor.close.remote()
         worker.actor.__ray_terminate__.remote()
         self._leaving.append((worker.actor, monotonic()))
         return True
 
     def start(self, case: EvalCase) -> None:
-        """Start an actor with the resources of the case, if possible near its policy."""
+        """Start an actor with the resources that the case needs, if possible near the policy."""
         workers_by_node = Counter(worker.node for worker in self._workers)
         node = self._placement.node(case.policy.url, workers_by_node)
         options = {
@@ -127,7 +134,7 @@ class WorkerPool(Workers):
         self._workers.append(worker)
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
-        """Send jobs to a worker, which answers in `wait`."""
+        """Send jobs to a worker; `wait` receives the reports."""
         phase: Phase = "env reset" if worker.env_place == jobs[0].case.place else "make"
         worker.jobs = jobs
         worker.heartbeat, worker.heartbeat_at = Heartbeat(phase, 0.0, 0), monotonic()
@@ -138,13 +145,13 @@ class WorkerPool(Workers):
         """Yield the reports that arrive within `timeout_s`, including those of workers that died or
         hung.
 
-        Such a worker is killed, as is one that reports that its simulator broke.
+        A worker that died, hung or reports that its simulator broke is killed.
 
         Raises:
-            ClusterLost: The head of the cluster has not answered for long.
+            ClusterLost: The head of the cluster has not answered for too long.
         """
         self._head.answers()
-        owners: dict[Any, WorkerHandle] = {}  # by the reference of an awaited answer
+        owners: dict[Any, WorkerHandle] = {}  # workers by the reference of the awaited answer
         for worker in self._workers:
             for ref in (worker.starting, worker.running, worker.query):
                 if ref is not None:
@@ -152,7 +159,7 @@ class WorkerPool(Workers):
 
         if owners:
             done, waiting = ray.wait(list(owners), num_returns=1, timeout=timeout_s)
-            # Each pass looks at every worker, so it takes all answers that have arrived.
+            # Each pass checks every worker, so it should process all answers that have arrived.
             if done and waiting:
                 done += ray.wait(waiting, num_returns=len(waiting), timeout=0)[0]
             for ref in done:
@@ -184,7 +191,7 @@ class WorkerPool(Workers):
             worker.query = None
             try:
                 worker.heartbeat, worker.heartbeat_at = ray.get(ref), monotonic()
-            except RayError as error:  # the result of its job reports the same error
+            except RayError as error:  # the result of the job reports the same error
                 log.debug("a worker did not answer: %s", error)
         elif worker.jobs:
             jobs = worker.jobs
@@ -217,7 +224,8 @@ class WorkerPool(Workers):
         try:
             worker.process = ray.get(worker.starting)
         except RayError as error:
-            # Workers that were requested before the last failure may have failed together with it.
+            # Workers that were requested before the last failure may have failed for the same
+            # reason.
             if worker.started_at > self._last_failed_start:
                 self._failed_starts += 1
                 self._last_failed_start = monotonic()
@@ -237,8 +245,7 @@ class WorkerPool(Workers):
         now = monotonic()
         if self.busy:
             self._capacity.note_playing()
-        # Kill workers that do not end by themselves: they hold resources that their successors wait
-        # for.
+        # Kill workers that do not end by themselves, since new workers wait for their resources.
         for actor, since in self._leaving:
             if now - since > CLOSE_S:
                 ray.kill(actor)
@@ -264,7 +271,7 @@ class WorkerPool(Workers):
                 worker.query = worker.actor.progress.options(concurrency_group="watch").remote()
 
     def _overdue(self, worker: WorkerHandle, now: float) -> str | None:
-        """Return why the busy `worker` must be replaced; None if it need not be."""
+        """Return the reason why the busy `worker` must be replaced; None if there is no reason."""
         heartbeat = worker.heartbeat
         limit_s = self._limits.of_phase(heartbeat.phase)
         if heartbeat.age_s > limit_s + GRACE_S:
@@ -272,8 +279,7 @@ class WorkerPool(Workers):
                 f"{heartbeat.phase} after {heartbeat.steps} steps took longer than {limit_s:g} "
                 "s; the worker was killed"
             )
-        # A simulator that hangs in C code holds the interpreter's lock, so that no call is
-        # answered.
+        # A simulator that hangs in C code keeps the interpreter lock, so that no call is answered.
         silent_s = now - worker.heartbeat_at
         if silent_s > max(limit_s, self._limits.env_s) + GRACE_S + watch_s(len(self._workers)):
             return (
@@ -283,14 +289,14 @@ class WorkerPool(Workers):
         return None
 
     def _with_log(self, failure: Failure, worker: WorkerHandle) -> Failure:
-        """Add the worker's log to the failure; a lost node is awaited only once, whatever its
-        number of workers.
+        """Add the worker's log to the failure. The timeout for a lost node occurs only once, even
+        if the node had several workers.
         """
         host: str = worker.process["host"]
         if monotonic() < self._unreachable.get(host, 0.0) or not self._head.answers():
             return failure
-        # Slurm signals all processes of a job at once. Ray's calls would then block until it kills
-        # this process.
+        # Slurm sends signals to all processes of a job at once. Calls to Ray would then block until
+        # Slurm kills this process.
         sleep(SIGNAL_S)
         if head_is_gone():
             return failure
@@ -302,14 +308,14 @@ class WorkerPool(Workers):
 
 
 def watch_s(workers: int) -> float:
-    """Return the time between two queries of one of so many workers, s."""
+    """Return the time between two queries of a worker, s, given the number of workers."""
     return max(WATCH_S, workers / QUERIES_PER_S)
 
 
 def _kill(actors: list[Any]) -> None:
     for actor in actors:
-        # `__exit__` has stopped waiting; a call to Ray now would start another cluster.
+        # `__exit__` no longer waits for this thread; a call to Ray now would start another cluster.
         if not ray.is_initialized():
             return
-        with contextlib.suppress(RayError):  # it ends with this process in any case
+        with contextlib.suppress(RayError):  # the actor ends with this process in any case
             ray.kill(actor)

@@ -1,8 +1,8 @@
 """The code of a worker process: an environment or a batch of them, an agent, and one episode after
 another.
 
-`Rollout` is plain Python; `vlagents_ray.evaluate.workers.pool` makes a Ray actor of it. It reports
-the failures of an episode instead of raising them, so that no exception has to survive pickling.
+`Rollout` is plain Python; `vlagents_ray.evaluate.workers.pool` makes a Ray actor of it. It returns
+the failures of an episode instead of raising them, so that no exception must be pickled.
 """
 
 from __future__ import annotations
@@ -60,18 +60,18 @@ log = logging.getLogger(__name__)
 
 AgentFactory = Callable[[PolicyConfig], Agent]
 OwnAgents = Callable[[], Agent] | Mapping[str, Callable[[], Agent]] | None
-# Set before any import in the worker, since several workers share a machine.
+# Thread settings that are set before any import in a worker, since several workers share a machine.
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "MKL_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "NUMEXPR_NUM_THREADS",
     "OPENCV_FOR_THREADS_NUM",
-    "LP_NUM_THREADS",  # llvmpipe and lavapipe, Mesa's software renderers
+    "LP_NUM_THREADS",  # for llvmpipe and lavapipe, Mesa's software renderers
 )
-FIRST_WAIT_S = 0.5  # s before the next attempt to reach a policy, doubled each time
+FIRST_WAIT_S = 0.5  # s, pause before the next attempt to reach a policy, doubled each time
 LONGEST_WAIT_S = 10.0
-LONG_S = 1.0  # s in one phase, after which a query also reports the stack
+LONG_S = 1.0  # s, duration of a phase after which a query also reports the stack
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,46 +81,47 @@ class Report:
     result: EpisodeResult | None = None
     failure: Failure | None = None
     artifacts: Artifacts = field(default_factory=Artifacts)
-    env: EnvInfo | None = None  # if an environment was made for the job
-    # Metadata of the policy ({} for a local one), if the connection is new.
+    env: EnvInfo | None = None  # set if an environment was created for the job
+    # Metadata of the policy ({} for a local policy); set if the connection is new.
     policy: dict[str, Any] | None = None
-    worker: WorkerInfo | None = None  # if the environment or the policy is new
+    worker: WorkerInfo | None = None  # set if the environment or the policy is new
 
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """A worker's current phase, and how long it has lasted."""
+    """A worker's current phase, and the duration of the phase so far."""
 
     phase: episode.Phase
     age_s: float
     steps: int
-    stack: str = ""  # the stack, if the phase has lasted for long
+    stack: str = ""  # the stack, if the phase has lasted for a long time
 
 
 class Rollout:
-    """Plays jobs. Keeps its agent and its environment until a job needs another."""
+    """Runs jobs. Keeps the agent and the environment until a job needs different ones."""
 
     def __init__(self, agent_factory: AgentFactory, recorders: RecorderFactory) -> None:
         self._agent_factory = agent_factory
         self._recorders = recorders
         self._agent: Agent | None = None
         self._policy: str | None = None  # the policy of the agent
-        self._local_metadata: dict[str, Any] = {}  # of an agent without a server: its weights
-        self._broken_agents = 0  # in a row
+        # Metadata of an agent without a server: its weights.
+        self._local_metadata: dict[str, Any] = {}
+        self._broken_agents = 0  # number of consecutive broken agents
         self._sessions: list[Agent] = []  # further sessions of the agent, for parallel episodes
         self._env: BatchEnv | None = None
         self._env_place: str | None = None  # `EvalCase.place` of the environment
-        self._repeatable = True  # whether every second pass so far repeated its episode
-        self._surplus = 0  # successes over failures in this environment
+        self._repeatable = True  # whether every second pass so far has repeated its episode exactly
+        self._surplus = 0  # number of successes minus number of failures in this environment
         self._thread = 0  # id of the thread that runs episodes
         self._current_phase: tuple[episode.Phase, float, int] = ("idle", monotonic(), 0)
 
     def ready(self, credentials: Credentials) -> dict[str, Any]:
-        """Return the process's host and id, and its log files, as soon as it runs.
+        """Return the host, the id and the log files of the process, as soon as the process runs.
 
-        The driver's API key is passed by this call, which goes straight to this process: the
-        cluster's head stores the arguments of an actor's constructor, and logs its runtime
-        environment.
+        This call, which Ray sends directly to the process, passes the driver's API key. The key
+        must not be in the arguments of the actor's constructor, which the cluster's head stores, or
+        in the runtime environment, which the head logs.
         """
         credentials.become_default()
         return {
@@ -139,11 +140,11 @@ class Rollout:
         return Heartbeat(phase, age_s, steps, stack)
 
     def run(self, jobs: tuple[Job, ...]) -> list[Report]:
-        """Play the episodes of one case, in parallel if there are several; return a report for
+        """Run the episodes of one case, in parallel if there are several, and return a report for
         each.
         """
         self._thread = threading.get_ident()
-        new_fields: dict[str, Any] = {}  # fields of the first report, whatever the outcome
+        new_fields: dict[str, Any] = {}  # fields of the first report, for any outcome
         try:
             reports = self._play(jobs, new_fields)
         except VLAgentsError as error:
@@ -165,8 +166,8 @@ class Rollout:
         self._drop_env()
 
     def _play(self, jobs: tuple[Job, ...], new_fields: dict[str, Any]) -> list[Report]:
-        """Play the episodes. Fields of the first report that describe a new agent or environment
-        are added to `new_fields`, also if an error is raised later.
+        """Run the episodes. Fields of the first report that describe a new agent or environment are
+        added to `new_fields`, even if an error is raised later.
         """
         case = jobs[0].case
         if self._agent is None or self._policy != case.policy.name:
@@ -174,8 +175,8 @@ class Rollout:
             new_fields["policy"] = self._local_metadata or _metadata(self._agent)
         if self._env is None or self._env_place != case.place:
             self._env = self._make_env(case)
-            # The description is of plain values, since the driver may have another numpy, which
-            # cannot read this one's pickles.
+            # Convert the description to plain values, since the driver's version of numpy may not
+            # be able to read this version's pickles.
             new_fields["env"] = EnvInfo(
                 plain_values(self._env.describe()),
                 self._env.contract.to_json(),
@@ -239,7 +240,7 @@ class Rollout:
     def _finish_recording(
         self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder
     ) -> Artifacts:
-        """Return the artifacts of an episode; if images are missing, run it again."""
+        """Return the artifacts of an episode; if images are missing, run the episode again."""
         reset_options = job.case.suite.reset_options
         artifacts = recording.finish(
             result,
@@ -252,11 +253,11 @@ class Rollout:
         return artifacts
 
     def _renders_at_once(self, agent: Agent, env: BatchEnv, policy: PolicyConfig) -> bool:
-        """Return whether each step is rendered as it is executed, if only failures need images.
+        """Return whether to render each step when it is executed, if only failures need images.
 
-        The alternative is to run the failed episodes again. That saves nothing if the policy gets
-        each image, and costs more than it saves if most episodes fail. It is impossible if one
-        simulator runs several environments together.
+        The alternative is to run the failed episodes again. This saves nothing if the policy
+        receives every image, costs more than it saves if most episodes fail, and is impossible if
+        one simulator runs several environments together.
         """
         rows = policy.execute or (agent.contract.chunk if agent.contract is not None else None)
         return (
@@ -274,8 +275,8 @@ class Rollout:
         sessions = getattr(agent, "sessions", None)
         if sessions is None:
             raise ConfigError(
-                "num_envs: expected 1 for a policy in the worker's own process, got more; give "
-                "it a `url`"
+                "num_envs: expected 1 for a policy in the worker's own process, got more; serve "
+                "the policy and set its `url`"
             )
         if number > len(self._sessions):
             self._sessions += sessions(number - len(self._sessions))
@@ -285,10 +286,10 @@ class Rollout:
         self._current_phase = (phase, monotonic(), steps)
 
     def _connect(self, policy: PolicyConfig) -> Agent:
-        """Return a new agent of the policy, and close the present one."""
+        """Return a new agent for the policy, and close the present agent."""
         self._set_phase("connect", 0)
         self._drop_agent()
-        if self._broken_agents:  # the server may be restarting, or full
+        if self._broken_agents:  # the server may be restarting or full
             sleep(min(FIRST_WAIT_S * 2 ** (self._broken_agents - 1), LONGEST_WAIT_S))
 
         with policy_side("start"):
@@ -296,7 +297,7 @@ class Rollout:
         try:
             with policy_side("initialize"), used_checkpoints() as checkpoints:
                 agent.initialize()
-                # Fetches the metadata, which checks that the server runs and has the policy.
+                # Fetch the metadata, to check that the server runs and has the policy.
                 _metadata(agent)
         except VLAgentsError:
             agent.close()
@@ -309,14 +310,14 @@ class Rollout:
         return agent
 
     def _make_env(self, case: EvalCase) -> BatchEnv:
-        """Return the environment of the case, and close the present one."""
+        """Return the environment of the case, and close the present environment."""
         self._set_phase("make", 0)
-        self._drop_env()  # first, so that a worker never holds two simulators
+        self._drop_env()  # close first, so that a worker never has two simulators
         try:
             with env_side(f"{case.env!r}: make"):
                 options = case.suite.env_options
                 number = case.suite.num_envs
-                if number == 1:  # even if the suite has a simulator for many
+                if number == 1:  # True even if the suite has a simulator for many environments
                     env: BatchEnv = SequentialBatch([make_env(case.env, **options)])
                 else:
                     env = make_batch(case.env, number, **options)
@@ -341,7 +342,7 @@ class Rollout:
         for agent in agents_to_close:
             try:
                 agent.close()
-            except VLAgentsError as error:  # the connection is broken: nothing is left to close
+            except VLAgentsError as error:  # the connection is broken, so there is nothing to close
                 log.warning("closing the agent: %s", error)
 
     def _drop_env(self) -> None:
@@ -371,12 +372,12 @@ def own_logs() -> list[str]:
 def agents(
     plan: ResolvedPlan, own: OwnAgents = None, priority: PriorityName = "simulation"
 ) -> AgentFactory:
-    """Return the factory with which a worker makes an agent of a policy.
+    """Return the function with which a worker creates an agent for a policy.
 
     Args:
         plan: The policies, and the time limits of a connection.
-        own: Makes the agent of every policy, or, by the name of a policy, the agent of that one.
-            The agents of other policies are `RemoteAgent`s.
+        own: A function that creates the agent of every policy, or a mapping from policy names to
+            such functions. The agents of all other policies are `RemoteAgent`s.
         priority: The priority of the `RemoteAgent`s.
 
     Raises:
@@ -404,20 +405,20 @@ def _agent(
     if policy.name in factories:
         return factories[policy.name]()
     return RemoteAgent(
-        str(policy.url),  # `agents` has checked that there is one
+        str(policy.url),  # `agents` has checked that there is a URL
         transport=policy.transport,
         timeout_s=limits.policy_s,
         connect_timeout_s=limits.connect_s,
         codec=policy.codec,
         priority=priority,
-        # An interrupted episode runs again, so that its result depends only on its key.
+        # An interrupted episode must run again, so that its result depends only on its key.
         resume=False,
     )
 
 
 def factory_programs(plan: ResolvedPlan, own: OwnAgents) -> dict[str, Program]:
-    """Return the files of the agents that are made in the workers, by policy; the metadata of
-    served policies contains theirs.
+    """Return the files of the agents that the workers create, by policy; for served policies, the
+    metadata contain the files.
     """
     if callable(own):
         program = factory_program(own)
@@ -426,7 +427,7 @@ def factory_programs(plan: ResolvedPlan, own: OwnAgents) -> dict[str, Program]:
 
 
 def factory_program(make: Callable[[], Agent]) -> Program:
-    """Return the files of the module that defines `make`, and those that the arguments of a
+    """Return the files of the module that defines `make`, and the files that the arguments of a
     `partial` name.
     """
     settings: dict[str, Any] = {}
