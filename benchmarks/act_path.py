@@ -1,10 +1,10 @@
-"""The files and the classes of this project that one warm act enters, by transport, of client and
-server; beside them its calls of Python and C, and its system calls, as `benchmarks.calls` counts
-them.
+"""Counts the files and classes of this project that one warm inference call enters, in client and
+server, for each transport. It also shows the calls of Python and C and the system calls, as
+`benchmarks.calls` counts them.
 
-A file or a class counts if most of the acts enter it, on any thread: a thread that wakes up by
-chance during one of them does not add its files. How much a reader has to open to follow an act
-hardly depends on the machine.
+A file or a class counts if most calls enter it, on any thread; a thread that wakes up by chance
+during one call does not add its files. These numbers say how much code a reader has to open to
+follow a call, and hardly depend on the machine.
 """
 
 from __future__ import annotations
@@ -46,22 +46,22 @@ SIDES = ("client", "server")
 _COUNTS = ("Python", "C", "system")
 _ROOT = Path(vlagents_ray.__file__).parents[1]
 _PACKAGES = (f"{_ROOT / 'vlagents_ray'}/", f"{_ROOT / 'plugins'}/")
-_WARM_UP = 3  # acts after a reset
-_SETTLED_S = 0.02  # after its answer, the server records what an act took
-_ENTRIES = 100_000  # more than an act has
-_USUAL = 0.5  # share of the acts that enter a file
+_WARM_UP = 3  # calls after a reset
+_SETTLED_S = 0.02  # time for the server to record a call after its answer, s
+_ENTRIES = 100_000  # maximum number of entries, more than a call has
+_USUAL = 0.5  # minimum share of the calls that enter a file
 
 
 class Entry(NamedTuple):
     """A call of a function of this project."""
 
-    at_s: float  # of `time.perf_counter`
+    at_s: float  # time, s of `time.perf_counter`
     file: str
-    class_name: str  # class name of the object whose method it is; "" for another function
+    class_name: str  # name of the class of the object whose method it is; "" for a function
 
 
 class PathCounter(CallCounter):
-    """Counts calls, and notes those of functions of this project."""
+    """Counts calls, and records the calls of this project's functions."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -96,12 +96,12 @@ def _class_name(frame: FrameType) -> str:
 
 
 class TracedNoop(CountedNoop):
-    """The policy whose acts are traced: `reset` returns counts, or the path of a period."""
+    """The policy whose calls are traced: its `reset` returns counts, or the path of a period."""
 
     counter = PathCounter()
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Return the path from `begun_s` to `ended_s`; without these, counts.
+        """Return the path from `begun_s` to `ended_s`; without these times, return counts.
 
         On Linux, `time.perf_counter` is the same clock in all processes.
         """
@@ -111,10 +111,10 @@ class TracedNoop(CountedNoop):
 
 
 def usual(acts: Sequence[Sequence[str]]) -> list[str]:
-    """Return the names that most acts enter, in the order of the last act that enters them.
+    """Return the names that most calls enter, in the order of the last call that enters them.
 
     Args:
-        acts: The files or the classes of each act, in order.
+        acts: The files or the classes of each call, in order.
     """
     entered: Counter[str] = Counter()
     for names in acts:
@@ -127,7 +127,7 @@ def usual(acts: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _usual_path(paths: Iterable[Mapping[str, Sequence[str]]]) -> dict[str, list[str]]:
-    """Return the usual "files" and "classes" of the paths of several acts."""
+    """Return the usual "files" and "classes" of the paths of several calls."""
     all_paths = list(paths)
     files = usual([path["files"] for path in all_paths])
     classes = usual([path["classes"] for path in all_paths])
@@ -137,14 +137,14 @@ def _usual_path(paths: Iterable[Mapping[str, Sequence[str]]]) -> dict[str, list[
 def trace_path(
     agent: RemoteAgent, counter: PathCounter, obs: Obs, acts: int
 ) -> dict[str, dict[str, list[str]]]:
-    """Return the "files" and the "classes" of one act, of the "client" and of the "server", whose
+    """Return the "files" and the "classes" of one call in the "client" and in the "server", whose
     policy is `TracedNoop`.
 
     Args:
         agent: The client.
-        counter: Of the client's threads.
-        obs: What each act sends.
-        acts: Number of acts, of which the usual path is returned.
+        counter: The counter of the client's threads.
+        obs: The observation of each call.
+        acts: Number of calls from which the usual path is computed.
     """
     client: list[dict[str, list[str]]] = []
     server: list[dict[str, list[str]]] = []
@@ -176,7 +176,7 @@ def trace_acts(clients: Sequence[OwnClient], acts: int) -> list[dict[str, Any]]:
         [(app, url)] = server.apps.items()
         for client in clients:
             counter = PathCounter()
-            threading.setprofile(counter.count)  # of the threads that the client starts
+            threading.setprofile(counter.count)  # counts on the threads that the client starts
             address = f"serve://{app}" if client.actor else url
             with connect(address, client.transport, client.codec) as agent:
                 counts = counted(agent, observation(), acts)
@@ -188,7 +188,7 @@ def trace_acts(clients: Sequence[OwnClient], acts: int) -> list[dict[str, Any]]:
 
 
 def main(
-    acts: Annotated[int, typer.Option(min=1, help="Acts that are counted.")] = 200,
+    acts: Annotated[int, typer.Option(min=1, help="Number of calls that are counted.")] = 200,
     transports: Transports = "",
     table_of_page: Annotated[
         bool,
@@ -196,8 +196,8 @@ def main(
     ] = False,
     out_file: Out = None,
 ) -> None:
-    """Show the files and the classes of this project that one act enters, its calls of Python and
-    C, and its system calls, by transport.
+    """Show the files and classes of this project that one inference call enters, its calls of
+    Python and C, and its system calls, for each transport.
     """
     with errors():
         only = parse_list(transports)
@@ -240,14 +240,14 @@ def page_table(ways: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[
 
 
 def _cells(side: Mapping[str, Any], decimals: int) -> list[str]:
-    """Return the numbers of one side of an act, as text."""
+    """Return the numbers of one side of a call, as text."""
     sizes = [str(len(side[kind])) for kind in ("files", "classes")]
     counts = [f"{side[name]:.{decimals}f}" if name in side else "" for name in _COUNTS]
     return sizes + counts
 
 
 def show(measured: Mapping[str, Any]) -> None:
-    """Print the table of counts, and the path of each way."""
+    """Print the table of counts, and the path of each transport."""
     rows = table("way", "side", "files", "classes", *_COUNTS)
     for way in measured["ways"]:
         for side in SIDES:

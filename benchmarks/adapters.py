@@ -1,9 +1,9 @@
-"""Cost of sessions with many fine-tunes: LoRA adapters over one base in one batch, against a whole
-model for each.
+"""Measures the cost of sessions with many fine-tunes: LoRA adapters over one base in one batch,
+compared with a whole model for each session.
 
 Each variant runs in its own process. The adapters are random, for all linear layers, over a
-checkpoint of a family that supports them; the models are loaded from that checkpoint, which takes
-as much memory and time as merged ones.
+checkpoint of a family that supports them; the models are all loaded from that checkpoint, which
+takes as much memory and time as merged models would.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def measure_adapters(
     rank: int,
     rounds: int,
 ) -> dict[str, Any]:
-    """Return the memory of the process, MiB, and the acts a second of CPU time, by variant and
+    """Return the memory of the process, MiB, and the actions per second of CPU time, by variant and
     round.
 
     Args:
@@ -82,7 +82,7 @@ def _loaded(policy: str, config: dict[str, Any]) -> ModelPolicy:
 def _random_adapters(
     policy: str, config: dict[str, Any], count: int, rank: int, folder: Path
 ) -> dict[str, str]:
-    """Write adapters of all linear layers, as PEFT does; returns their folders by name."""
+    """Write adapters of all linear layers, as PEFT does, and return their folders by name."""
     agent, rng = _loaded(policy, config), np.random.default_rng(0)
     modules = attrgetter(agent.network or "")(agent).named_modules()
     shapes = {name: one.weight.shape for name, one in modules if type(one).__name__ == "Linear"}
@@ -129,7 +129,7 @@ def _measure(
 
 
 def _run(agents: list[ModelPolicy], views: list[Obs], sessions: list[Agent], size: int) -> None:
-    """Run one act of all sessions as a replica's engine does: one batch for each model."""
+    """Compute one action for each session as a replica's engine does: one batch for each model."""
     for number, agent in enumerate(agents):
         part = slice(number * size, (number + 1) * size)
         for act in agent.act_batch(views[part], sessions[part]):
@@ -145,17 +145,17 @@ def main(
     checkpoint: Annotated[str, typer.Argument(help="The base: a folder or hub id.")],
     policy: Annotated[str, typer.Option(help="The policy's name.")] = "pi0",
     sessions: Annotated[
-        int, typer.Option(min=1, help="Sessions, each with a fine-tune of its own.")
+        int, typer.Option(min=1, help="Number of sessions, each with a separate fine-tune.")
     ] = 10,
     rank: Annotated[int, typer.Option(min=1, help="Rank of the adapters.")] = 16,
     state: Annotated[
         list[str] | None, typer.Option(help="NAME=LENGTH of a part of the state.")
     ] = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Batches of all sessions.")] = 7,
+    rounds: Annotated[int, typer.Option(min=1, help="Number of batches of all sessions.")] = 7,
     out_file: Out = None,
 ) -> None:
-    """Measure the cost of sessions with many fine-tunes: adapters over one base, against a model
-    for each.
+    """Measure the cost of sessions with many fine-tunes: adapters over one base, compared with a
+    model for each.
     """
     with errors():
         dims = parse_dims(state or [], "--state-dim")

@@ -1,4 +1,4 @@
-"""Autoscaling of replicas: a timeline of one run on this machine.
+"""Measures the autoscaling of replicas: a timeline of one run on this machine.
 
 An application with `min_replicas` of 0 serves, one after the other, a single robot, a burst of
 robots, rollout workers, and a single robot again, with pauses until the last replica has stopped.
@@ -39,11 +39,11 @@ from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi
 from vlagents_ray_cluster.tune.line_process import LineProcess, ProcessFailed, our_environment
 
 _SUFFIXES = (".png", ".svg", ".pdf")
-_SESSIONS, _P95 = SERIES[4], SERIES[1]  # colours
+_SESSIONS, _P95 = SERIES[4], SERIES[1]  # colours of the plot
 _APP = "noop"
-_EVERY_S = 0.5  # between two samples of the replicas
-_ANSWER_S = 0.3  # time limit for a replica to state its number of sessions
-_LATE_S = 180.0  # by which a burst may exceed its plan, as replicas start
+_EVERY_S = 0.5  # time between two samples of the replicas, s
+_ANSWER_S = 0.3  # time limit for a replica to report its number of sessions, s
+_LATE_S = 180.0  # time by which a burst may exceed its plan, as replicas start, s
 _QUIET_S = 180.0
 _FROM_NONE = {
     "min_replicas": 0,
@@ -61,10 +61,10 @@ class AutoscalingPlan:
     robots: int = 12
     hz: float = 10.0
     workers: int = 8
-    seconds: float = 25.0  # seconds of a burst
-    alone_s: float = 5.0  # of a single robot
-    policy_ms: float = 40.0  # policy of a batch
-    batch: int = 2  # so that one replica gives 50 actions a second
+    seconds: float = 25.0  # duration of a burst, s
+    alone_s: float = 5.0  # duration of a phase with a single robot, s
+    policy_ms: float = 40.0  # time of a batch, ms
+    batch: int = 2  # batch size with which one replica computes 50 actions per second
     step_ms: float = 20.0
     steps: int = 50
     autoscaling: Mapping[str, float] = field(default_factory=_FROM_NONE.copy)
@@ -73,8 +73,8 @@ class AutoscalingPlan:
 class ScaleSample(NamedTuple):
     """The state of the application at one moment."""
 
-    at: float  # s of `time.time()`
-    requested: int  # replicas
+    at: float  # time, s of `time.time()`
+    requested: int  # number of requested replicas
     running: int
     sessions: int
 
@@ -83,10 +83,12 @@ class LoadPhase(NamedTuple):
     """A phase in which robots or workers were connected."""
 
     name: str
-    begun: float  # s of `time.time()`
+    begun: float  # time, s of `time.time()`
     ended: float
-    acts: Sequence[tuple[float, float]]  # s, ms; of rollouts an episode's median
-    first_reset_s: float | None  # of the robot that waited longest; rollouts connect before
+    # End, s, and duration, ms, of each call; for rollouts the median of each episode.
+    acts: Sequence[tuple[float, float]]
+    # Duration of the longest first reset, s; None for rollouts, which connect earlier.
+    first_reset_s: float | None
     resumed: int
     failed: Sequence[str]
 
@@ -94,7 +96,7 @@ class LoadPhase(NamedTuple):
 def measure_autoscaling(
     plan: AutoscalingPlan, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Run all phases; returns plain JSON values, with times in s since the first robot
+    """Run all phases, and return plain JSON values, with times in s since the first robot
     connected.
     """
     served = deployment(
@@ -202,7 +204,7 @@ class ScaleWatcher:
         self._thread.join()
 
     def wait_for_quiet(self, replicas: int) -> None:
-        """Wait until no session and at most `replicas` are left. Raises `ProcessFailed` after
+        """Wait until no session and at most `replicas` are left. Raises `ProcessFailed` after some
         minutes.
         """
         deadline = time.monotonic() + _QUIET_S
@@ -240,7 +242,7 @@ def sessions_of_replicas(app: str) -> list[int]:
 
 
 def _details(app: str) -> dict[str, Any]:
-    """Return what Serve knows of the policy's deployment."""
+    """Return Ray Serve's status of the policy's deployment."""
     from ray.serve.context import _get_global_client
 
     client = _get_global_client()
@@ -261,7 +263,7 @@ def _sessions(replicas: Sequence[str]) -> Iterator[int]:
 
     asked = []
     for name in replicas:
-        with contextlib.suppress(ValueError):  # it has ended
+        with contextlib.suppress(ValueError):  # the replica has ended
             asked.append(
                 call_replica(
                     ray.get_actor(name, namespace="serve"), SiblingApi.peer, "Rebalancer.load"
@@ -302,7 +304,9 @@ def report(
 
 
 def by_second(acts: Sequence[tuple[float, float]], begun: float) -> list[dict[str, float]]:
-    """Return median and 95 % quantile of the acts of each second, by its middle."""
+    """Return the median and the 95 % quantile of the calls in each second, by the middle of the
+    second.
+    """
     durations_ms: dict[int, list[float]] = {}
     for at, ms in acts:
         durations_ms.setdefault(int((at - begun) // 1), []).append(ms)
@@ -326,8 +330,8 @@ def _most(samples: Sequence[ScaleSample], phase: LoadPhase) -> int:
 
 
 def check_plot_file(file: Path | None) -> None:
-    """Raise `ConfigError` for a suffix that is not .png, .svg or .pdf, `MissingDependency`
-    without matplotlib.
+    """Raise `ConfigError` if the suffix is not .png, .svg or .pdf, and `MissingDependency` if
+    matplotlib is not installed.
     """
     if file is None:
         return
@@ -385,14 +389,14 @@ def plot_autoscaling(measured: Mapping[str, Any], file: Path) -> None:
         latency.set_title("Latency per call, ms (line: median, dots: 95th percentile)")
         latency.set_xlabel("time since the first robot connected, s")
         most = max(sample["sessions"] for sample in measured["samples"])
-        sessions.set_ylim(0, 2.4 * max(1, most))  # room for the names of the phases
+        sessions.set_ylim(0, 2.4 * max(1, most))  # space for the names of the phases
         for axes in (sessions, replicas):
             axes.yaxis.get_major_locator().set_params(integer=True)
         save_figure(figure, file)
 
 
 def _phase_text(phase: Mapping[str, Any]) -> str:
-    """Return the name of a phase, in lines that are as short as its shade may be narrow."""
+    """Return the name of a phase, in lines that fit the width of the phase's shade."""
     text = textwrap.fill(str(phase["name"]), 10)
     if phase["failed"]:
         text += f"\n{len(phase['failed'])} failed"
@@ -427,12 +431,13 @@ def show_autoscaling(measured: Mapping[str, Any]) -> None:
 
 
 def main(
-    robots: Annotated[int, typer.Option(min=1, help="That come at once.")] = 12,
+    robots: Annotated[int, typer.Option(min=1, help="Number of robots that come at once.")] = 12,
     workers: Annotated[
-        int, typer.Option(min=1, help="Of the evaluation that comes after them.")
+        int, typer.Option(min=1, help="Number of workers of the evaluation that follows.")
     ] = 8,
     seconds: Annotated[
-        float, typer.Option(min=1, help="That each of the two stays, about.")
+        float,
+        typer.Option(min=1, help="Approximate duration of each of the two phases, in seconds."),
     ] = 25.0,
     out_file: Out = None,
     plot: Annotated[

@@ -1,4 +1,4 @@
-"""A policy without a server, as a process of `throughput`: `python -m benchmarks.bare_policy
+"""Runs a policy without a server, as a process of `throughput`: `python -m benchmarks.bare_policy
 JSON`.
 """
 
@@ -15,8 +15,8 @@ from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdou
 
 
 class BarePolicy:
-    """A policy without a server, `batch` observations at a time, as the reference for a served
-    one.
+    """A policy without a server, with batches of `batch` observations, as the reference for a
+    served policy.
     """
 
     def __init__(self, policy: str, config: dict[str, Any], batch: int) -> None:
@@ -27,7 +27,7 @@ class BarePolicy:
         self._batch()
 
     def rate(self, seconds: float) -> float:
-        """Measure for at least `seconds`; returns actions a second."""
+        """Measure for at least `seconds`, and return the actions per second."""
         begun = time.perf_counter()
         batches = 0
         while (taken := time.perf_counter() - begun) < seconds or batches == 0:
@@ -43,8 +43,8 @@ class BarePolicy:
 
 
 def main() -> None:
-    """Run a bare policy as a process: the settings are JSON; it answers each line, a time in s,
-    with the rate.
+    """Run a bare policy as a process: the settings are JSON, and each line with a time in s is
+    answered with the rate.
     """
     die_with_parent()
     out = own_stdout()

@@ -1,9 +1,7 @@
-"""The calls of Python, the system calls and the context switches of one warm act, by transport, of
-client and server.
-
-Unlike times, they hardly depend on the machine and its load. Waiting is left out: how often a
-thread polls depends on the time that the other side takes. System calls are counted by `strace`, if
-it is installed.
+"""Counts the calls of Python, the system calls and the context switches of one warm inference call,
+in client and server, for each transport. Unlike times, these counts hardly depend on the machine
+and its load. Waiting does not count, as the number of polls depends on the time that the other side
+needs. System calls are counted by `strace`, if it is installed.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
 POLICY = "benchmarks.calls:CountedNoop"
-WARM_UP = 50  # acts
+WARM_UP = 50  # number of calls before counting
 _WAITING = {
     "_wait_for_request",
     "_wait_for_event",
@@ -56,20 +54,20 @@ _WAITING_CALLS = {
     "restart_syscall",
     "sched_yield",
 }
-_OFTEN = 0.5  # calls an act; rarer ones are of other threads
+_OFTEN = 0.5  # minimum number of calls per act; rarer calls belong to other threads
 Counts = dict[str, float]
 
 
 class CallCounter:
-    """Counts the calls on the threads that it is installed for."""
+    """Counts the calls on the threads on which it is installed."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._thread = 0
 
     def install(self) -> None:
-        """Count on this thread, on those that start later, and on those of the event loops of
-        this process.
+        """Count on this thread, on threads that start later, and on the threads of this process's
+        event loops.
         """
         threading.setprofile(self.count)
         sys.setprofile(self.count)
@@ -86,7 +84,7 @@ class CallCounter:
                 self._counts["hand-overs"] += 1
 
     def read(self) -> Counts:
-        """Return the counts so far, and those that the kernel has of this process."""
+        """Return the counts so far, and the kernel's counts for this process."""
         used = resource.getrusage(resource.RUSAGE_SELF)
         return {"Python": 0, "C": 0, "hand-overs": 0, **self._counts, "switches": used.ru_nvcsw}
 
@@ -104,14 +102,14 @@ class CountedNoop(Noop):
 
 
 def counted(agent: RemoteAgent, obs: Obs, acts: int) -> dict[str, Counts]:
-    """Return the counts of one act, of the "client" and of the "server", whose policy is
+    """Return the counts of one call for the "client" and for the "server", whose policy is
     `CountedNoop`.
     """
     counter = CallCounter()
     begun = agent.reset(obs)
     for _ in range(WARM_UP):
         agent.act(obs)
-    # Twice as many acts the second time, so that the reset itself drops out.
+    # The second run has twice as many calls, so that the difference does not contain the reset.
     snapshots = [agent.reset(obs)]
     for number in (acts, 2 * acts):
         before = counter.read()
@@ -141,15 +139,15 @@ def counted(agent: RemoteAgent, obs: Obs, acts: int) -> dict[str, Counts]:
 
 @contextlib.contextmanager
 def traced(target: Sequence[str]) -> Iterator[Counter[str]]:
-    """Count the system calls of a process or thread within the context, without those that wait,
-    in the result.
+    """Count the system calls of a process or thread within the context, except those that wait; the
+    result is yielded.
     """
     calls: Counter[str] = Counter()
     with tempfile.NamedTemporaryFile("r") as summary:
         command = ["strace", "-c", "-U", "calls,name", "-o", summary.name, *target]
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as strace:
             if strace.stderr is not None:
-                strace.stderr.readline()  # it has attached
+                strace.stderr.readline()  # strace has attached
             yield calls
             strace.terminate()
         for words in map(str.split, Path(summary.name).read_text().splitlines()):
@@ -179,12 +177,12 @@ def count_acts(own: Sequence[OwnClient], acts: int) -> list[dict[str, Any]]:
 
 
 def main(
-    acts: Annotated[int, typer.Option(min=1, help="Acts that are counted.")] = 200,
+    acts: Annotated[int, typer.Option(min=1, help="Number of calls that are counted.")] = 200,
     transports: Transports = "",
     out_file: Out = None,
 ) -> None:
-    """Count the calls of Python and C, the system calls and the context switches of one act, by
-    transport.
+    """Count the calls of Python and C, the system calls and the context switches of one inference
+    call, for each transport.
     """
     with errors():
         own, skipped = own_clients(parse_list(transports))

@@ -1,9 +1,7 @@
-"""Round trips of the clients in other languages beside those of the Python client, interleaved at
-one server.
-
-Each client is a process, and all send the same raw pixels. Build the client in TypeScript first:
-`cd clients/typescript && npm ci && npm run build`. The one in C++ is compiled here, with the
-packages in its README.md.
+"""Measures round trips of the clients in other languages and of the Python client, interleaved at
+one server. Each client is a process, and all send the same raw pixels. Build the client in
+TypeScript first: `cd clients/typescript && npm ci && npm run build`. The C++ client is compiled
+here, with the packages in its README.md.
 """
 
 from __future__ import annotations
@@ -76,7 +74,7 @@ def measure_clients(
 
 
 def _compiled(folder: Path) -> str:
-    """Return the path of the C++ client, compiled as a release is."""
+    """Compile the C++ client as for a release, and return its path."""
     program = str(folder / "cpp_client")
     command = [
         "c++",
@@ -101,8 +99,8 @@ def _compiled(folder: Path) -> str:
 
 
 def _save(obs: Obs, folder: Path) -> None:
-    """Write the observation for clients in any language: the pixels of each camera, and the rest
-    as JSON.
+    """Write the observation for clients in any language: the pixels of each camera, and all other
+    values as JSON.
     """
     cameras = {}
     for name, image in obs.cameras.items():
@@ -115,10 +113,10 @@ def _save(obs: Obs, folder: Path) -> None:
 
 
 def main(
-    calls: Annotated[int, typer.Option(min=1, help="Acts of each client.")] = 2000,
+    calls: Annotated[int, typer.Option(min=1, help="Number of calls of each client.")] = 2000,
     out_file: Out = None,
 ) -> None:
-    """Measure round trips of the clients in other languages, beside the Python client's."""
+    """Measure round trips of the clients in other languages and of the Python client."""
     with errors():
         with running_server(deployment(POLICY), host="127.0.0.1") as server:
             [url] = server.apps.values()

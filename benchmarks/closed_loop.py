@@ -1,4 +1,4 @@
-"""Load by clients that act again at each answer, a thread for each.
+"""Makes load with clients that send their next request at each answer; each client has a thread.
 
 It needs only the standard library: the scripts of other policy servers (`benchmarks/peers`) load
 this file with a Python without vlagents_ray.
@@ -12,12 +12,14 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 Act = Callable[[], tuple[float, float, int]]  # round trip, ms; inference, ms; size of the batch
-Call = tuple[float, float, float, int]  # end, s of time.monotonic; then as `Act`
-_THINK_S = 0.05  # longest pause of a robot after an answer, so that it meets batches at any stage
+# End, s of `time.monotonic`, followed by the values of `Act`.
+Call = tuple[float, float, float, int]
+# Maximum pause of a robot after an answer, so that its requests meet batches at any stage, s.
+_THINK_S = 0.05
 
 
 class ClosedLoop:
-    """Clients of one process: `robots` robots, and after them simulations."""
+    """The clients of one process: first `robots` robots, then simulations."""
 
     def __init__(self, acts: Sequence[Act], robots: int) -> None:
         self._robots, self._simulations = acts[:robots], acts[robots:]
@@ -28,7 +30,7 @@ class ClosedLoop:
         same moment.
 
         Returns:
-            For each client, robots first, its calls that ended after `begin`.
+            For each client, robots first, the calls that ended after `begin`.
         """
         chosen = [(act, _THINK_S) for act in self._robots[:robots]]
         chosen += [(act, 0.0) for act in self._simulations[:simulations]]
@@ -49,7 +51,7 @@ class ClosedLoop:
                 time.sleep(think.uniform(0, think_s))
             try:
                 call = act()
-            except TimeoutError:  # of a server whose batch waits for clients that have ended
+            except TimeoutError:  # the server's batch waits for clients that have ended
                 if time.monotonic() < end:
                     raise
                 break

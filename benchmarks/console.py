@@ -1,4 +1,4 @@
-"""Options that several measurements have, the table of round trips, and the file of figures."""
+"""Options that several measurements share, the table of round trips, and the file of figures."""
 
 from __future__ import annotations
 
@@ -14,17 +14,20 @@ from vlagents_ray.cli.console import out, table
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError
 
-Calls = Annotated[int, typer.Option(min=1, help="Round trips by each way.")]
+Calls = Annotated[int, typer.Option(min=1, help="Number of round trips for each client.")]
 Seconds = Annotated[float, typer.Option(min=0.1, help="Of each measurement.")]
 Rounds = Annotated[int, typer.Option(min=1)]
-Out = Annotated[Path | None, typer.Option("--out", help="File of the figures, as JSON.")]
+Out = Annotated[Path | None, typer.Option("--out", help="File for the figures, as JSON.")]
 Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma; default: all.")]
-# Ratios in a row that fit on a screen with their intervals; the file of figures has all.
+# Maximum number of ratios in a row that fit on a screen with their intervals; the file of figures
+# has all ratios.
 _WITH_INTERVALS = 5
 
 
 def show_round_trips(found: Mapping[str, Any], title: str) -> None:
-    """Print a row for each client, the fastest first; beside ours, the ratios to other servers."""
+    """Print a row for each client, the fastest first; rows of our clients also have the ratios to
+    other servers.
+    """
     theirs = [peer["way"] for peer in found["peers"]]
     rows = table("way", "median ms", "95 % interval", "p99 ms", *(f"/ {name}" for name in theirs))
     rows.title = f"{title}: two 224x224 RGB cameras, no-op policy"
@@ -64,7 +67,7 @@ USE_COLUMNS = (
 
 
 def use_cells(use: Mapping[str, Any]) -> list[str]:
-    """Return the cells of `USE_COLUMNS` for what an act uses of client and server."""
+    """Return the cells of `USE_COLUMNS` for the resources that a call uses in client and server."""
     client, server = use["client"], use["server"]
     programs = sorted(server["programs"].items(), key=lambda one: -one[1])
     return [
@@ -100,7 +103,7 @@ def show_skipped(found: Mapping[str, Any]) -> None:
 
 
 def parse_counts(text: str, option: str) -> list[int]:
-    """Parse numbers from 1 on with commas between them, and return them in ascending order."""
+    """Parse a comma-separated list of numbers of at least 1, and return them in ascending order."""
     try:
         counts = sorted({int(one) for one in parse_list(text)})
     except ValueError as error:

@@ -1,19 +1,16 @@
-"""A day of control without a jump: `python -m benchmarks.day --seed 1`, 24 simulated hours at 50 Hz
-with faults.
+"""Tests that a day of control has no jump: `python -m benchmarks.day --seed 1` simulates 24 hours
+at 50 Hz with faults. Control loop, chunk player, guard, watchdog and command inbox are those of a
+real robot; the arm, the network, the server, the operator and all clocks are simulated, so that a
+day takes some minutes, and a seed repeats it exactly. At each command the simulation checks:
 
-Control loop, chunk player, guard, watchdog and command inbox are those of a robot; the arm, the
-network, the server, the operator and all clocks are simulated, so that a day takes minutes, and a
-seed replays exactly. Checked at each command:
+- no step is above 3 times the largest step of a run without faults, or above the speed limit, even
+  from the measured pose after a stop;
+- there is no command after a stop or a pause until the operator at the robot has restarted it.
 
-- no step above 3 times the largest one of a run without faults, and none above the limit of speed,
-  also not from the measured pose after a stop;
-- no command after a stop or a pause until the operator at the robot has restarted it.
-
-`--relative` runs the day with relative actions, `--arms 2` with two arms. Exit status: 0 without a
-violation, else 1. `--hours` and the seed repeat a violation, whose time the report has.
-
-`--ticks 20000` measures in place of a day what a tick costs: of the guard, and from `observe` until
-`apply` with and without it.
+`--relative` runs the day with relative actions, `--arms 2` with two arms. The exit status is 0
+without a violation, otherwise 1. The report has the time of a violation, which the same seed and a
+suitable `--hours` repeat. `--ticks 20000` instead measures the cost of a tick: the guard alone, and
+from `observe` to `apply` with and without the guard.
 """
 
 from __future__ import annotations
@@ -52,22 +49,23 @@ from vlagents_ray.robot import Guard, LoopOptions, MotionLimits, Watchdog, loop,
 from vlagents_ray.robot.simulated import SimulatedRobot
 
 HZ = 50.0
-RUN_S = 3600.0  # a run of the control loop; the arm goes to its rest pose between two
-CHUNK = 50  # rows: 1 s
+# Duration of a run of the control loop, s; between two runs the arm goes to its rest pose.
+RUN_S = 3600.0
+CHUNK = 50  # number of rows, which last 1 s
 INFERENCE_S = 0.03
-TIMEOUT_S = 10.0  # timeout of a request
-FACTOR = 3.0  # a step above this multiple of the normal one is a jump
-_TURN = 2 * math.pi / (4 * HZ)  # turn of the path in a tick: one round takes 4 s
-_RADIUS = 0.5  # rad
-_SWAY = 0.0005  # rad, distance of the paths of two chunks
+TIMEOUT_S = 10.0  # timeout of a request, s
+FACTOR = 3.0  # A step above this multiple of the normal step is a jump.
+_TURN = 2 * math.pi / (4 * HZ)  # change of the path's angle in a tick, rad: one round takes 4 s
+_RADIUS = 0.5  # radius of the path, rad
+_SWAY = 0.0005  # distance of the paths of two chunks, rad
 _SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a tick
-_LAG = 1.0  # ticks by which the joints are behind their targets, with that smoothing
+_LAG = 1.0  # number of ticks by which the joints lag behind their targets, with this smoothing
 REST = (_RADIUS, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0)
-SPEED = 2.0  # rad/s
+SPEED = 2.0  # speed limit, rad/s
 # The motion limits of an arm.
 LIMITS = MotionLimits(velocity=SPEED, acceleration=15.0, jerk=1000.0, rest=(*REST[:6], None))
-_PULL = 0.0005  # rad, largest correction of a relative action towards the path in a tick
-FAULTS = {  # the mean duration of each, s; 0: a moment
+_PULL = 0.0005  # maximum correction of a relative action towards the path in a tick, rad
+FAULTS = {  # the mean duration of each fault, s; 0 for a moment
     "killed": 15.0,
     "frozen": 5.0,
     "far": 120.0,
@@ -89,12 +87,12 @@ FAULTS = {  # the mean duration of each, s; 0: a moment
     "restart from afar": 0.0,
     "pushed": 0.0,
 }
-_EVERY_S = 45.0  # mean time between two faults
+_EVERY_S = 45.0  # mean time between two faults, s
 
 
 class DayClock:
-    """Stands for the module `time` in those that run; it advances by ticks, and its wall time may
-    be set.
+    """Replaces the module `time` in the modules of the control loop. It advances by ticks, and its
+    wall time may be set.
     """
 
     def __init__(self) -> None:
@@ -122,20 +120,20 @@ class DayReport:
     relative: bool = False
     arms: int = 1
     runs: int = 0
-    failed_runs: int = 0  # that ended by an error
+    failed_runs: int = 0  # number of runs that ended with an error
     stops: int = 0
-    restarts: int = 0  # by the operator at the robot
-    normal_step: float = 0.0  # rad
-    largest_step: float = 0.0  # rad
+    restarts: int = 0  # number of restarts by the operator at the robot
+    normal_step: float = 0.0  # largest step of a run without faults, rad
+    largest_step: float = 0.0  # largest step, rad
     faults: dict[str, int] = field(default_factory=dict)
-    # Ticks without the policy, by cause, in whole runs.
+    # Number of ticks without the policy, by cause, in whole runs.
     held: dict[str, int] = field(default_factory=dict)
     violations: list[str] = field(default_factory=list)
     digest: str = ""  # digest of all commands
 
 
 class World:
-    """The simulated arm, its surroundings and its operator; `robot` methods are those of
+    """The simulated arm, its surroundings and its operator; its `robot` methods are those of
     `vlagents_ray.robot.Robot`.
     """
 
@@ -153,10 +151,10 @@ class World:
         self.grippers = self.action.gripper_columns(len(REST) * arms)
         self.joints = np.tile(np.array(REST, np.float32), arms)
         self.target = self.joints.copy()
-        self.commanded = self.joints.copy()  # the last command, or the pose at rest
+        self.commanded = self.joints.copy()  # the last command, or the rest pose
         self.holds: str | None = None
-        self.until: dict[str, float] = {}  # the end of each fault that lasts
-        self.forbidden: str | None = None  # the reason why nothing may be commanded
+        self.until: dict[str, float] = {}  # the end of each current fault, s
+        self.forbidden: str | None = None  # the reason why no command is allowed
         self.restart_at = math.inf
         self.hang_s = 0.0
         self.guard_fails = False
@@ -168,11 +166,13 @@ class World:
         self.watchdog.clock = self.clock
 
     def has(self, fault: str) -> bool:
-        """Return whether a fault lasts."""
+        """Return whether a fault is active."""
         return self.until.get(fault, 0.0) > self.clock.now
 
     def observe(self) -> Obs:
-        """Return the joints, or the observation of before while the camera hangs."""
+        """Return an observation of the joints; while the camera hangs, return the previous
+        observation.
+        """
         self.joints = self.joints + np.float32(_SMOOTHING) * (self.target - self.joints)
         if self._picture is None or not self.has("old picture"):
             self._picture = Obs(
@@ -199,7 +199,7 @@ class World:
         self.target = self.commanded = target
 
     def stop(self, reason: str = "") -> None:
-        """Make the present pose the target; the grippers keep their grasp."""
+        """Make the current pose the target; the grippers keep their grasp."""
         held = self.joints.copy()
         held[self.grippers] = self.target[self.grippers]
         self.target = self.commanded = held
@@ -216,7 +216,9 @@ class World:
         return np.full_like(joints, np.nan) if self.has("broken sensor") else joints
 
     def advance(self, seconds: float) -> None:
-        """Let time pass: faults begin and end, the watchdog looks, and the operator comes."""
+        """Advance the time: faults begin and end, the watchdog checks, and the operator may
+        come.
+        """
         self.clock.now += seconds
         if self.clock.now >= self._next_fault:
             self._next_fault = self.clock.now + self.random.exponential(_EVERY_S)
@@ -242,7 +244,7 @@ class World:
         self.restart_at = min(self.restart_at, self.clock.now + 3 + self.random.exponential(20.0))
 
     def _come(self) -> None:
-        """Restart the robot as its operator."""
+        """Restart the robot, as the operator does."""
         self.restart_at = math.inf
         if self.watchdog.restart():
             self.watchdog.control.resume()
@@ -262,7 +264,7 @@ class World:
             self.hang_s = 0.5
         elif fault == "clock step":
             self.clock.offset += self.random.normal(0.0, 10.0)
-        elif fault == "pushed":  # only an arm without commands can be moved by hand
+        elif fault == "pushed":  # only an arm that receives no commands can be moved by hand
             if self.forbidden is not None:
                 self.joints = self.joints + self.random.uniform(-0.2, 0.2, len(self.joints)).astype(
                     np.float32
@@ -291,8 +293,8 @@ class DayWatchdog(Watchdog):
 
 
 class DayPolicy(Agent):
-    """A policy that leads the arm around a closed path from any pose, behind a network and a
-    server with faults.
+    """A policy that moves the arm along a closed path from any pose, behind a network and a server
+    with faults.
     """
 
     contract: Contract | None = None
@@ -311,7 +313,7 @@ class DayPolicy(Agent):
         return answer
 
     def answer(self, obs: Obs) -> tuple[float, Act | Exception]:
-        """Return the answer to a request that is sent now, and when it arrives, s."""
+        """Return the answer to a request that is sent now, and the time of its arrival, s."""
         world, random = self.world, self.world.random
         now = world.clock.now
         if world.has("killed"):
@@ -352,7 +354,7 @@ class DayPolicy(Agent):
         rows = path[1:].astype(np.float32)
         if world.deltas:
             behind = np.roll(path, 1, axis=0)[1:]
-            # This also corrects the lag, which is the same all day.
+            # This also corrects the lag, which is constant during the day.
             pull = np.clip((path[0] - joints) / CHUNK, -_PULL, _PULL)
             rows[:, world.deltas] = (path[1:] - behind + pull)[:, world.deltas]
         place = int(random.integers(CHUNK))
@@ -368,7 +370,9 @@ class DayPolicy(Agent):
 
 
 class DayCaller:
-    """Stands for `AsyncCaller`: an answer is taken when the simulated time has come."""
+    """Replaces `AsyncCaller`: an answer is available once the simulated time reaches its
+    arrival.
+    """
 
     def __init__(self, agent: DayPolicy) -> None:
         self._agent = agent
@@ -395,7 +399,7 @@ class DayCaller:
 
 
 class DayGuard(Guard):
-    """A guard that fails once when the world plants it."""
+    """A guard that raises an error once when the world requests this fault."""
 
     world: World
 
@@ -450,12 +454,12 @@ def play_day(
     relative: bool = False,
     arms: int = 1,
 ) -> DayReport:
-    """Play a day.
+    """Simulate a day.
 
     Args:
-        seed: Draws the faults, the delays, and when the operator comes.
-        hours: Its length.
-        faults: Whether there are any.
+        seed: The seed of the faults, the delays, and the times at which the operator comes.
+        hours: The length of the day, hours.
+        faults: Whether there are faults.
         normal_step: The largest step of a run without faults, rad; 0 checks no steps.
         relative: Whether actions are relative.
         arms: The number of arms, of seven numbers each.
@@ -503,7 +507,7 @@ def play_day(
 
 
 class CirclePolicy(Agent):
-    """Moves all joints to and fro, from rest."""
+    """Moves all joints back and forth, beginning at rest."""
 
     contract: Contract | None = None
 
@@ -543,8 +547,8 @@ def limits_of(joints: int) -> MotionLimits:
 
 
 def tick_us(joints: int, ticks: int, *, part: str) -> list[float]:
-    """Measure part of each tick, µs: "guard", or from `observe` until `apply`, "loop" or "loop
-    without guard".
+    """Measure a part of each tick, µs: "guard", or the time from `observe` to `apply` as "loop" or
+    "loop without guard".
     """
     policy, took = CirclePolicy(joints), list[float]()
     guard = (
@@ -574,11 +578,11 @@ def tick_us(joints: int, ticks: int, *, part: str) -> list[float]:
 
 
 def measure_ticks(ticks: int) -> dict[str, dict[str, float]]:
-    """Return median and 99 % quantile of each part of a tick, µs."""
+    """Return the median and the 99 % quantile of each part of a tick, µs."""
     found = {}
     for joints in (7, 14):
         for part in ("guard", "loop", "loop without guard"):
-            tick_us(joints, ticks // 10, part=part)  # warm
+            tick_us(joints, ticks // 10, part=part)  # warms up
             p50, p99 = np.quantile(tick_us(joints, ticks, part=part), [0.5, 0.99])
             found[f"{part}, {joints} joints"] = {
                 "p50_us": round(float(p50), 1),
@@ -590,14 +594,17 @@ def measure_ticks(ticks: int) -> dict[str, dict[str, float]]:
 def main(
     seed: int = 0,
     hours: Annotated[float, typer.Option(help="of simulated time")] = 24.0,
-    relative: Annotated[bool, typer.Option(help="play it with relative actions")] = False,
+    relative: Annotated[bool, typer.Option(help="simulate the day with relative actions")] = False,
     arms: Annotated[int, typer.Option(min=1, max=8)] = 1,
     ticks: Annotated[
-        int, typer.Option(help="measure the cost of so many ticks, and play no day")
+        int,
+        typer.Option(help="measure the cost of this number of ticks instead of simulating a day"),
     ] = 0,
     out_file: Out = None,
 ) -> None:
-    """Play a day with faults, and compare its steps with those of ten minutes without."""
+    """Simulate a day with faults, and compare its steps with those of ten minutes without
+    faults.
+    """
     if ticks:
         measured = measure_ticks(ticks)
         save({"ticks": measured}, out_file)

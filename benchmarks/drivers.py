@@ -16,17 +16,18 @@ class Driver(Protocol):
     """A connected client, which makes calls in its turn."""
 
     def ready(self) -> dict[str, Any]:
-        """Wait until it is connected and warm; returns its description."""
+        """Wait until the client is connected and warm, and return its description."""
 
     def measure(self, calls: int) -> list[float]:
-        """Make calls; returns their durations, ms."""
+        """Make calls, and return their durations, ms."""
 
 
 class ProcessDriver(Driver, Protocol):
     """A driver whose client is another process."""
 
-    pid: int  # process id of the client, once it is ready
-    server_pid: int | None  # id of the process that has started its server; None: this one
+    pid: int  # process id of the client, once the client is ready
+    # Id of the process that has started the client's server; None for this process.
+    server_pid: int | None
 
 
 class ClientProcess(LineProcess):
@@ -35,13 +36,13 @@ class ClientProcess(LineProcess):
     server_pid: int | None = None
 
     def ready(self) -> dict[str, Any]:
-        """Read the first line of a client, its description, which it writes when it is connected
-        and warm.
+        """Read the first line of a client: the description that the client writes when it is
+        connected and warm.
         """
         said: dict[str, Any] = self.read(START_S)
         return said
 
     def measure(self, calls: int) -> list[float]:
-        """Make calls in the client's process; returns their durations, ms."""
+        """Make calls in the client's process, and return their durations, ms."""
         taken: list[float] = self.request(str(calls), CALL_S + calls)
         return taken

@@ -1,8 +1,6 @@
-"""Environments of the measurements: any one that records its times, and one that takes time but no
-CPU.
-
-It imports only the standard library, numpy and this package's light part, since the peers' Python
-imports it as well.
+"""Environments of the measurements: a wrapper of any environment that records its times, and an
+environment that takes time but no CPU. This module imports only the standard library, numpy and
+this package's light part, since it is also imported in the other systems' Python.
 """
 
 from __future__ import annotations
@@ -20,24 +18,24 @@ from vlagents_ray.envs.base import EvalEnv, known_contract, make_env, one_row
 from vlagents_ray.envs.graphics import Renderer
 from vlagents_ray.interface import Act, Obs
 
-TIMED_ENV = "benchmarks.environments:TimedEnv"  # its name for `make_env`
+TIMED_ENV = "benchmarks.environments:TimedEnv"  # name of the environment for `make_env`
 SLEEPING_ENV = "benchmarks.environments:SleepingEnv"
-ACTION_DIM = 4  # action dim of the latter
+ACTION_DIM = 4  # action dimension of `SleepingEnv`
 
 
 class EpisodeTimes(NamedTuple):
-    """When an episode that was run to its end began and ended."""
+    """The beginning and the end of an episode that was run to its end."""
 
-    begun: float  # s of time.time(), before its reset
-    ended: float  # after its last step
+    begun: float  # time before the reset, s of time.time()
+    ended: float  # time after the last step, s of time.time()
     steps: int
     seed: int
 
 
 class TimedEnv(EvalEnv):
-    """Any environment, which writes the begin and end of each episode to a file for each process.
-
-    Episode `seed` begins in initial state `seed` modulo their number, whoever resets it.
+    """Any environment, with a record of the beginning and end of each episode in one file per
+    process. The episode with seed `seed` begins in initial state `seed` modulo the number of
+    initial states.
     """
 
     def __init__(
@@ -52,10 +50,10 @@ class TimedEnv(EvalEnv):
         """Make the environment.
 
         Args:
-            notes: The folder of the files.
+            notes: The folder of the files with the records.
             env: The name of the environment.
-            size: Pixels a side of its images.
-            max_steps: Its step limit.
+            size: Width and height of the images, pixels.
+            max_steps: The step limit.
             step_ms: Additional CPU time of each step, in place of a simulator's physics.
         """
         self._env = make_env(env, width=size, height=size, max_steps=max_steps)
@@ -94,14 +92,15 @@ class TimedEnv(EvalEnv):
         return self._env.reset(seed=seed, options=options)
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        # CPU time: wall time would pass while others have the core.
+        # The loop uses CPU time, since wall time would also pass while other processes have the
+        # core.
         until = time.thread_time() + self._step_s
         self._env.looked_at = self.looked_at
         found = self._env.step(act)
         while self._step_s and time.thread_time() < until:
             pass
         self._steps += 1
-        if found[3]:  # truncated: nothing else ends it
+        if found[3]:  # truncate the episode: nothing else ends it
             with (self._notes / f"{os.getpid()}.txt").open("a") as file:
                 file.write(f"{self._begun!r} {time.time()!r} {self._steps} {self._seed}\n")
         return found
@@ -111,8 +110,8 @@ class TimedEnv(EvalEnv):
 
 
 def read_episode_times(folder: Path) -> dict[int, list[EpisodeTimes]]:
-    """Read the episodes of each process, by its id, in order. A line that is being written is
-    left out.
+    """Return the episodes of each process in order, by process id. A line that is being written is
+    ignored.
     """
     found = {}
     for file in folder.glob("*.txt"):
@@ -128,12 +127,12 @@ def read_episode_times(folder: Path) -> dict[int, list[EpisodeTimes]]:
 
 
 class SleepingEnv(EvalEnv):
-    """Each step sleeps `step_ms`, so that many of them run on few cores; an episode is
-    `max_steps` of them.
+    """An environment whose steps sleep for `step_ms`, so that many environments run on few cores.
+    An episode has `max_steps` steps.
     """
 
     def __init__(self, *, step_ms: float = 20.0, max_steps: int = 50, size: int = 224) -> None:
-        """Take `size`, the pixels a side of the one camera."""
+        """Make the environment; `size` is the width and height of the only camera, pixels."""
         self.max_steps = max_steps
         self._step_s = step_ms / 1e3
         self._contract = Contract(

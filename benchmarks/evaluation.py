@@ -1,29 +1,29 @@
-"""Episodes a minute of whole evaluations, ours and the peers' own, in alternating rounds on one
-machine.
+"""Measures episodes per minute of whole evaluations, ours and those of other systems, in
+alternating rounds on one machine.
 
 Each system runs the same episodes of one environment (`environments.TimedEnv`: same code, image
-size, step limit, seeds and initial states) with a policy that does nothing behind its own server,
-by its own command, and keeps its results. A round runs each system once:
+size, step limit, seeds and initial states) with a policy that does nothing behind the system's own
+server, with the system's own command, and stores the results. A round runs each system once:
 
 - ours: `vlagents-ray eval`, which serves the policy for the length of the run;
-- vlagents: `run-eval`, over shared memory. It runs one configuration in one process, its first
-  variant here; the second splits the episodes into one configuration for each worker, each with its
-  own process and server;
+- vlagents: `run-eval`, over shared memory. It runs one configuration in one process, which is the
+  first variant here. The second variant splits the episodes into one configuration for each worker,
+  each with its own process and server;
 - vla-eval: one model server, and as many shards as `vlagents-ray eval` has workers, without Docker;
 - lerobot: `lerobot-eval`, the policy in its process, with as many environments, which it steps one
   after another.
 
 `--env` names a simulator: it must be installed in this Python and, with the peers, in
 `--peers-python` (`peers/requirements-simulators.txt` has LIBERO and ManiSkill; vlagents, which
-needs numpy 1, cannot be there). With `--chunk 8` our policy returns as many rows, and images
-between two requests are not rendered; peers render each step.
+needs numpy 1, cannot be there). With `--chunk 8` our policy returns 8 rows, and images between two
+requests are not rendered; the other systems render each step.
 
 For ours, summary.json also has the shares of the time in which the simulators and the policy were
 busy.
 
-The rate is that from the first reset to the last step, so that start-up and shutdown do not count:
-those of `run-eval` contain a fixed sleep of 30 s. The wall time of the whole command is the second
-figure.
+The rate counts from the first reset to the last step, so that start-up and shutdown do not count;
+`run-eval` sleeps for a fixed time of 30 s in them. The second figure is the wall time of the whole
+command.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ from vlagents_ray.serve.ports import LOOPBACK, free_block
 from vlagents_ray_cluster.tune.line_process import LineProcess, ProcessFailed, our_environment
 
 OURS = "vlagents-ray"
-SPLIT = "vlagents, split"  # into a configuration for each worker
-# scripts.
+SPLIT = "vlagents, split"  # variant of vlagents with a configuration for each worker
+# Scripts of the other systems.
 PEERS = {
     "vlagents": "vlagents_peer.py",
     "vla-eval": "vla_eval_peer.py",
@@ -76,21 +76,21 @@ _CURES = {
     ),
     "lerobot": f"`{_SIMULATORS}` makes an environment",
 }
-_MOST_S = 3600.0  # for one command
+_MOST_S = 3600.0  # time limit of one command, s
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluationPlan:
-    """The episodes that all systems play."""
+    """The episodes that all systems run."""
 
-    episodes: int = 200  # in all
-    workers: int = 2  # 0: `vlagents-ray eval` runs in its own process
+    episodes: int = 200  # total number of episodes
+    workers: int = 2  # number of workers; with 0, `vlagents-ray eval` runs in its own process
     rounds: int = 3
-    size: int = 224  # pixels a side
-    max_steps: int = 80  # nothing else ends an episode
-    step_ms: float = 0.0  # additional CPU time of each env step
+    size: int = 224  # width and height of images, pixels
+    max_steps: int = 80  # step limit; nothing else ends an episode
+    step_ms: float = 0.0  # additional CPU time of each environment step, ms
     name: str = "tabletop"  # name of the environment
-    chunk: int = 1  # rows of an answer of ours
+    chunk: int = 1  # number of rows in an answer of our policy
 
     def __post_init__(self) -> None:
         if self.episodes % max(1, self.workers):
@@ -105,23 +105,24 @@ class EvaluationPlan:
 
     @property
     def action_dim(self) -> int:
-        """The numbers of an action."""
+        """The number of values in an action."""
         contract = known_contract(self.name, {})
-        # LIBERO's, and ManiSkill's by default.
+        # The action dimension of LIBERO, and of ManiSkill by default.
         return 7 if contract is None else contract.action.dim or 7
 
 
 class Played(NamedTuple):
     """The figures of one command."""
 
-    episodes_per_minute: float  # from the first reset to the last step
-    wall_s: float  # wall time of the whole command
-    first_s: float | None = None  # from the start of the command to the first reset
-    env_busy: float | None = None  # share of the workers' time, of ours alone
-    policy_busy: float | None = None  # share of the replica's time, of ours alone
+    episodes_per_minute: float  # rate from the first reset to the last step
+    wall_s: float  # wall time of the whole command, s
+    first_s: float | None = None  # time from the start of the command to the first reset, s
+    env_busy: float | None = None  # busy share of the workers' time; only for our evaluation
+    policy_busy: float | None = None  # busy share of the replica's time; only for our evaluation
 
 
-Run = Callable[[Path, Path], None]  # given its own folder and that of the notes
+# Is called with the system's folder and with the folder of the records.
+Run = Callable[[Path, Path], None]
 
 
 def measure_evaluation(
@@ -131,7 +132,7 @@ def measure_evaluation(
     peers_python: Path,
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Measure all systems; returns plain JSON values. Peers that cannot run here are in
+    """Measure all systems, and return plain JSON values. Systems that cannot run here are in
     `skipped`, with the reason.
     """
     wanted = list(PEERS) if "all" in peers else peers
@@ -169,12 +170,12 @@ def measure_evaluation(
 
 
 def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
-    """Run the plan with one system. Raises `ProcessFailed` if it did not play exactly those
+    """Run the plan with one system. Raises `ProcessFailed` if the system did not run exactly these
     episodes.
     """
     notes = folder / "notes"
     notes.mkdir(parents=True)
-    begun = time.time()  # the clock of the notes
+    begun = time.time()  # the clock of the records
     run(folder, notes)
     wall_s = time.time() - begun
     episodes = [note for each in read_episode_times(notes).values() for note in each]
@@ -194,7 +195,7 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
 
 
 def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
-    """Return our rate over theirs and their wall time over ours: both are above 1 if we are
+    """Return our rate over theirs and their wall time over ours: both ratios are above 1 if we are
     faster.
     """
     pairs = list(zip(ours, theirs, strict=True))
@@ -209,8 +210,8 @@ def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
 
 
 def alone(folder: Path) -> dict[str, str]:
-    """Return variables that let another Python import our two packages, and no others of this
-    Python.
+    """Return environment variables with which another Python can import our two packages, but no
+    other packages of this Python.
     """
     place = folder / "path"
     place.mkdir()
@@ -220,8 +221,8 @@ def alone(folder: Path) -> dict[str, str]:
 
 
 def our_run(plan: EvaluationPlan) -> Run:
-    """Return the run of `vlagents-ray eval`, which serves the policy or, without workers, runs
-    it itself.
+    """Return the function that runs `vlagents-ray eval`, which serves the policy or, without
+    workers, runs it itself.
     """
 
     def run(folder: Path, notes: Path) -> None:
@@ -256,7 +257,7 @@ def our_run(plan: EvaluationPlan) -> Run:
 def their_runs(
     plan: EvaluationPlan, scripts: Mapping[str, Path], python: Path, environment: Mapping[str, str]
 ) -> dict[str, Run]:
-    """Return the run of each peer in `scripts`; vlagents has two."""
+    """Return the function that runs each system in `scripts`; vlagents has two."""
 
     def way(name: str, peer: str, workers: int) -> Run:
         def run(folder: Path, notes: Path) -> None:
@@ -322,22 +323,29 @@ def show_evaluation(found: Mapping[str, Any]) -> None:
 
 
 def main(
-    episodes: Annotated[int, typer.Option(min=1, help="Of each system and round.")] = 200,
+    episodes: Annotated[
+        int, typer.Option(min=1, help="Number of episodes of each system in each round.")
+    ] = 200,
     workers: Annotated[int, typer.Option(min=1)] = 2,
     peers: Annotated[
         str, typer.Option(help="vlagents, vla-eval, lerobot, with commas between them, or 'all'.")
     ] = "",
     rounds: Annotated[int, typer.Option(min=1)] = 3,
-    size: Annotated[int, typer.Option(min=32, help="Pixels a side of the image.")] = 224,
-    max_steps: Annotated[int, typer.Option(min=1, help="Steps of an episode.")] = 80,
+    size: Annotated[
+        int, typer.Option(min=32, help="Width and height of the image, in pixels.")
+    ] = 224,
+    max_steps: Annotated[int, typer.Option(min=1, help="Number of steps of an episode.")] = 80,
     env_ms: Annotated[
-        float, typer.Option(min=0, help="CPU time that each env step takes more.")
+        float, typer.Option(min=0, help="Additional CPU time of each environment step, in ms.")
     ] = 0.0,
     env: Annotated[
         str, typer.Option(help="The environment: libero/libero_spatial/0, maniskill/PushCube-v1.")
     ] = "tabletop",
     chunk: Annotated[
-        int, typer.Option(min=1, help="Rows of each answer of ours, all of which are executed.")
+        int,
+        typer.Option(
+            min=1, help="Number of rows in each answer of our policy, all of which are executed."
+        ),
     ] = 1,
     peers_python: PeersPython = PYTHON,
     out_file: Out = None,
@@ -346,8 +354,8 @@ def main(
         typer.Option(help="Add the figures to this file of `python -m benchmarks.report --out`."),
     ] = None,
 ) -> None:
-    """Measure episodes a minute of whole evaluations: `vlagents-ray eval`, and the peers' own
-    commands, interleaved.
+    """Measure episodes per minute of whole evaluations: `vlagents-ray eval` and the other systems'
+    own commands, interleaved.
     """
     with errors():
         plan = EvaluationPlan(episodes, workers, rounds, size, max_steps, env_ms, env, chunk)

@@ -1,4 +1,4 @@
-"""A robot whose policy is far away: `python -m benchmarks.far_away`.
+"""Measures a robot whose policy is far away: `python -m benchmarks.far_away`.
 
 The server and the robot are on two hosts of this machine (`benchmarks.hosts`), connected by a link
 with delay, loss and cuts (`benchmarks.far_link`). Each mode of the chunk player drives the robot
@@ -39,19 +39,19 @@ class Row:
 
     link: str
     mode: str
-    period_error_p50_ms: float  # difference of the time between two ticks from the period
+    period_error_p50_ms: float  # difference of the time between two ticks from the period, ms
     period_error_p99_ms: float
     acted: float  # share of the ticks with an action of the policy
     longest_without_s: float
-    spells: int  # stretches of ticks without an action of the policy
+    spells: int  # periods of ticks without an action of the policy
     spell_p50_s: float
-    age_p50_ms: float  # median age of the observation behind the executed actions of the policy
+    age_p50_ms: float  # age of the observation behind the policy's executed actions, ms
     age_p99_ms: float
     step_p99: float  # distance of consecutive actions of the policy
-    stops: int  # by the watchdog
+    stops: int  # number of stops by the watchdog
     reconnects: int
-    twice: int  # observations that the policy got twice in one session
-    recovered_s: float | None  # from the end of the cut to the next action of the policy
+    twice: int  # number of observations that the policy received twice in one session
+    recovered_s: float | None  # time from the end of the cut to the next action of the policy, s
     transport: str
     codec: str
 
@@ -90,9 +90,9 @@ def run(
         arm: The robot's process.
         link: The link.
         conditions: The delay, loss and rate of the link.
-        cut_s: The duration of the cut; 0: none.
-        cut_after_s: The begin of the cut.
-        seconds: The length of the run.
+        cut_s: The duration of the cut, s; 0 for no cut.
+        cut_after_s: The time of the cut after the beginning of the run, s.
+        seconds: The length of the run, s.
         how: Further arguments of `benchmarks.far_robot.drive`.
 
     Returns:
@@ -154,8 +154,8 @@ def measure(
     congestion: str,
     say: Callable[[str], None] = lambda _: None,
 ) -> list[Row]:
-    """Run each mode over a clean link, a long one, a long one that loses packets, and the same
-    with a cut.
+    """Run each mode over a link without faults, over a long link, over a long link that loses
+    packets, and over the same link with a cut.
     """
     rate = f"{mbit:g} Mbit/s"
     links = {
@@ -182,18 +182,22 @@ def measure(
 
 
 def main(
-    delay_ms: Annotated[float, typer.Option(min=0, help="Of the link, each way.")] = 80.0,
+    delay_ms: Annotated[
+        float, typer.Option(min=0, help="Delay of the link in each direction, in ms.")
+    ] = 80.0,
     loss: Annotated[
-        float, typer.Option(min=0, max=0.5, help="Share of the packets, each way.")
+        float, typer.Option(min=0, max=0.5, help="Share of lost packets in each direction.")
     ] = 0.02,
     mbit: Annotated[
-        float, typer.Option(min=0.1, help="What the link carries each way, Mbit/s.")
+        float, typer.Option(min=0.1, help="Rate of the link in each direction, in Mbit/s.")
     ] = 20.0,
-    cut_s: Annotated[float, typer.Option(min=0.1, help="How long the link is cut.")] = 10.0,
-    seconds: Annotated[float, typer.Option(min=8, help="Of each run, beside the cut.")] = 10.0,
-    modes: Annotated[str, typer.Option(help="Which ones, with commas; default: all.")] = ",".join(
-        MODES
-    ),
+    cut_s: Annotated[float, typer.Option(min=0.1, help="Duration of the cut, in seconds.")] = 10.0,
+    seconds: Annotated[
+        float, typer.Option(min=8, help="Duration of each run without the cut, in seconds.")
+    ] = 10.0,
+    modes: Annotated[
+        str, typer.Option(help="Modes, separated by commas; default: all.")
+    ] = ",".join(MODES),
     congestion: Annotated[
         str, typer.Option(help="TCP's congestion control: cubic, bbr.")
     ] = "cubic",

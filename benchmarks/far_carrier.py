@@ -1,9 +1,7 @@
-"""The process that carries a link between two hosts: `python -m benchmarks.far_carrier DEVICE PID
-PID`.
-
-It gets the device's name in the hosts, and the first process of each.
-It answers each line of `Conditions` with a line. It imports only the standard library, so that it
-starts at once.
+"""The process that carries the packets of a link between two hosts: `python -m
+benchmarks.far_carrier DEVICE PID PID`. Its arguments are the device's name in the hosts, and the
+first process of each host. It answers each line of `Conditions` with a line. It imports only the
+standard library, so that it starts quickly.
 """
 
 from __future__ import annotations
@@ -20,26 +18,26 @@ import sys
 import time
 from dataclasses import dataclass
 
-DEVICE = "far"  # its name in either host, unless a host has several
+DEVICE = "far"  # name of the device in each host, unless a host has several devices
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000  # linux/if_tun.h
-_QUEUE_S = 0.2  # delay of a full queue of the link; further packets are dropped
+_QUEUE_S = 0.2  # delay of a full queue of the link, s; further packets are dropped
 
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """The treatment of packets in either direction."""
+    """The treatment of packets in each direction."""
 
-    delay_ms: float = 0.0  # each way
-    loss: float = 0.0  # share of the packets, each by itself
-    mbit: float = 1000.0  # Mbit/s
-    cut: bool = False  # whether it carries nothing; packets on their way are lost as well
+    delay_ms: float = 0.0  # delay in each direction, ms
+    loss: float = 0.0  # share of lost packets; each packet is drawn separately
+    mbit: float = 1000.0  # rate, Mbit/s
+    cut: bool = False  # whether the link carries nothing; packets in transit are also lost
 
 
 class _Carrier:
-    """The two devices, and the packets on their way."""
+    """The two devices, and the packets in transit."""
 
     def __init__(self, device: str, *pids: str) -> None:
-        names = [f"{device}-{number}" for number in range(2)]  # in the switch
+        names = [f"{device}-{number}" for number in range(2)]  # names in the switch's namespace
         self._devices = [_device(name) for name in names]
         for name, pid in zip(names, pids, strict=True):
             subprocess.run(["ip", "link", "set", name, "netns", pid, "name", device], check=True)  # noqa: S607
@@ -47,7 +45,8 @@ class _Carrier:
         # Due time, number, device, and the packet.
         self._way: list[tuple[float, int, int, bytes]] = []
         self._count = 0
-        self._free_at = [0.0, 0.0]  # time at which the last packet to a device left its sender
+        # Time at which the last packet to each device left its sender, s.
+        self._free_at = [0.0, 0.0]
         self._random = random.Random(0)
 
     def run(self) -> None:
@@ -95,7 +94,7 @@ class _Carrier:
     def _write(self, device: int, packet: bytes) -> None:
         try:
             os.write(self._devices[device], packet)
-        except OSError:  # the host has ended, or its device is not up yet: the packet is lost
+        except OSError:  # the host has ended, or its device is not up yet, so the packet is lost
             return
 
 
@@ -108,7 +107,7 @@ def _device(name: str) -> int:
 def main() -> None:
     """Run the process of the link, in the network namespace of the switch."""
     carrier = _Carrier(*sys.argv[1:])
-    print("true", flush=True)  # noqa: T201 - it is there
+    print("true", flush=True)  # noqa: T201 - reports that the process is ready
     carrier.run()
 
 

@@ -1,9 +1,7 @@
 """A link between two hosts with delay, loss and cuts of IP packets, even if the kernel has no
-netem.
-
-Each host gets a TUN device, whose packets `benchmarks.far_carrier` carries to the other: real
-packets of the kernel's own TCP, with real retransmissions, congestion control and head-of-line
-blocking.
+netem. Each host gets a TUN device, whose packets `benchmarks.far_carrier` carries to the other
+host. These are real packets of the kernel's own TCP, with real retransmissions, congestion control
+and head-of-line blocking.
 
     with hosts(2) as [cloud, home], FarLink(cloud, home) as link:
         link.set(Conditions(delay_ms=80, loss=0.02))
@@ -22,7 +20,7 @@ from benchmarks.hosts import Host
 from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 _MTU = 1500
-# RFC 2544's, for tests of networks; hosts have the other half.
+# Addresses of RFC 2544 for tests of networks; hosts use the other half of the range.
 _ADDRESSES = ("198.19.0.1", "198.19.0.2")
 _START_S = 20.0
 _ANSWER_S = 10.0
@@ -34,15 +32,15 @@ class FarLink:
     def __init__(
         self, one: Host, other: Host, congestion: str = "cubic", device: str = "", own: bool = False
     ) -> None:
-        """Prepare the link, which begins with `with`.
+        """Prepare the link, which starts when its context is entered.
 
         Args:
-            one: The host of `address`.
-            other: That of `other_address`.
+            one: The host with the address `address`.
+            other: The host with the address `other_address`.
             congestion: TCP's congestion control, "cubic" or "bbr".
             device: The name of the device in either host, if a host has several.
-            own: Whether the link carries what is sent to the hosts' own addresses, in place of two
-                further ones.
+            own: Whether the link carries packets to the hosts' own addresses, instead of two
+                further addresses.
         """
         self._addresses = (one.address, other.address) if own else _ADDRESSES
         self.address, self.other_address = self._addresses

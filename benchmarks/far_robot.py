@@ -1,5 +1,5 @@
-"""A robot far from its policy, which records each tick: `python -m benchmarks.far_robot URL`; and
-its policy.
+"""A robot far from its policy, which records each tick (`python -m benchmarks.far_robot URL`), and
+the policy.
 
 Each line that the process reads is a run, {"mode": "async", "seconds": 20}. It answers with a line
 when the loop begins, and with its record when the loop ends.
@@ -28,14 +28,14 @@ from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
 HZ = 30.0
-CHUNK = 50  # rows: 1.7 s
-RESET_S, ACT_S = 10.0, 2.0  # time limits
-MAX_AGE_S = 3.0  # max age of the observation of an action that is executed
-SILENCE_S = 2.0  # after which the watchdog stops the robot
-MAX_STEP = 0.2  # max step of the guard
-_TURN = 2 * np.pi / (4 * HZ)  # turn of the path in a tick: one round takes 4 s
+CHUNK = 50  # number of rows, which last 1.7 s
+RESET_S, ACT_S = 10.0, 2.0  # time limits of the client, s
+MAX_AGE_S = 3.0  # maximum age of the observation of an action that is executed, s
+SILENCE_S = 2.0  # time without an answer after which the watchdog stops the robot, s
+MAX_STEP = 0.2  # maximum step of the guard
+_TURN = 2 * np.pi / (4 * HZ)  # change of the path's angle in a tick, rad: one round takes 4 s
 _SWAY = 0.03  # distance of the paths of two chunks
-_IMAGE = 224  # px
+_IMAGE = 224  # size of images, px
 # The player's options in each mode. With a deadline of 0, no tick waits for the network.
 MODES: Mapping[str, Mapping[str, Any]] = {
     "single actions": {"mode": "open_loop", "horizon": 1},
@@ -49,16 +49,16 @@ MODES: Mapping[str, Mapping[str, Any]] = {
 class FarConfig(BaseModel, extra="forbid"):
     """The policy's computing time."""
 
-    ms: float = Field(default=60.0, ge=0, description="time that a batch takes")
+    ms: float = Field(default=60.0, ge=0, description="duration of a batch")
 
 
 class FarPolicy(Agent):
     """Moves along a sine, with chunks that differ slightly from each other, like those of a real
     policy.
 
-    A row has the position, the tick of its observation, and the number of observations that came
-    twice. With real-time chunking a chunk begins with the rows that will have been executed, and
-    leaves them gradually.
+    A row contains the position, the tick of its observation, and the number of observations that
+    arrived twice. With real-time chunking a chunk begins with the rows that will have been
+    executed, and departs from them gradually.
     """
 
     Config: ClassVar[type] = FarConfig
@@ -106,15 +106,15 @@ class FarPolicy(Agent):
 
 @dataclass(slots=True)
 class Ticks:
-    """The record of each tick of a run. The first one is the reset's observation."""
+    """The record of each tick of a run. The first tick is the reset's observation."""
 
-    at_s: list[float] = field(default_factory=list)  # its begin, by `time.monotonic`
+    at_s: list[float] = field(default_factory=list)  # beginning of the tick, s of `time.monotonic`
     acted: list[bool] = field(default_factory=list)  # whether the policy's action was executed
-    # Age of the observation behind each executed action of the policy.
+    # Age of the observation behind each executed action of the policy, s.
     age_ticks: list[int] = field(default_factory=list)
-    # Distance of each such action from the one before.
+    # Distance of each such action from the previous one.
     step: list[float] = field(default_factory=list)
-    twice: int = 0  # observations that the policy saw twice in one session
+    twice: int = 0  # number of observations that the policy received twice in one session
 
 
 class FarRobot(SimulatedRobot):
@@ -134,7 +134,9 @@ class FarRobot(SimulatedRobot):
         return obs
 
     def here(self, obs: Obs) -> np.ndarray:
-        """Return the action that holds its position, also before the first action of the policy."""
+        """Return the action that holds the robot's position, also before the first action of the
+        policy.
+        """
         return np.array([self._joints[0], *obs.state["ticks"]], np.float32)
 
     def note(self, act: Act) -> None:
@@ -163,8 +165,8 @@ class NotingPlayer(ChunkPlayer):
 
 
 class NotingAgent(RemoteAgent):
-    """A client that counts the answers before which the session had to begin again, also those
-    that the player drops as the robot was stopped meanwhile.
+    """A client that counts the answers before which the session had to begin again, including
+    answers that the player drops because the robot was stopped in the meantime.
     """
 
     resumed = 0
@@ -184,9 +186,8 @@ def drive(
     recovers: bool = False,
     began: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
-    """Drive the robot by the policy for `seconds`, and return the record.
-
-    With `recovers`, the run ends earlier if the policy has driven for a second since a stop.
+    """Run the robot with the policy for `seconds`, and return the record. With `recovers`, the run
+    ends earlier if the policy has controlled the robot for a second since a stop.
     """
     with NotingAgent(url, timeout_s=RESET_S) as agent:
         robot = FarRobot(agent.contract)

@@ -1,8 +1,8 @@
 """The policy of `benchmarks.far_robot` behind the endpoints of a replica, in one process without
 Ray.
 
-`python -m benchmarks.far_server PORT` writes a line when it serves, and answers each line with the
-numbers of held and of opened sessions. It ends with its standard input.
+`python -m benchmarks.far_server PORT` writes a line when it is ready, and answers each line with
+the numbers of current and of opened sessions. It ends when its standard input ends.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main() -> None:
     print(json.dumps("ready"), file=out, flush=True)
     for _ in sys.stdin:
         print(json.dumps([len(engine.sessions), engine.sessions.opened]), file=out, flush=True)
-    os._exit(0)  # even if clients are still connected
+    os._exit(0)  # the server ends even if clients are still connected
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The figures of measurements: medians, intervals and ratios without assuming a distribution."""
+"""Statistics of measurements: medians, intervals and ratios that assume no distribution."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class RoundTrips:
     """Milliseconds of each call of one client, by round."""
 
     name: str
-    rounds: np.ndarray  # (rounds, calls of each) float64, ms
+    rounds: np.ndarray  # (rounds, calls per round) float64, ms
 
     @property
     def ms(self) -> np.ndarray:
@@ -45,7 +45,7 @@ class RoundTrips:
 
 
 class Ratio(NamedTuple):
-    """A median over another, with its 95 % bootstrap interval."""
+    """The ratio of two medians, with its 95 % bootstrap interval."""
 
     ratio: float
     low: float
@@ -68,8 +68,8 @@ _T = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
 def mean_interval(rounds: Sequence[float]) -> tuple[float, float] | None:
-    """Return the 95 % interval of the mean of 2 to 10 rounds, by Student's t; None for a single
-    one.
+    """Return the 95 % interval of the mean of 2 to 10 rounds with Student's t; None for a single
+    round.
     """
     n = len(rounds)
     if n < 2:
@@ -81,9 +81,9 @@ def mean_interval(rounds: Sequence[float]) -> tuple[float, float] | None:
 def median_ratio(ours: RoundTrips, theirs: RoundTrips, *, seed: int = 0) -> Ratio:
     """Return the ratio of the two medians.
 
-    The bootstrap draws whole rounds, the same of both, because calls of one round, and adjacent
-    rounds, share the machine's other load. Raises `ValueError` unless both have the same number of
-    rounds.
+    The bootstrap draws whole rounds, and the same rounds for both, because calls of one round, and
+    adjacent rounds, share the machine's other load. Raises `ValueError` unless both have the same
+    number of rounds.
     """
     if len(ours.rounds) != len(theirs.rounds):
         raise ValueError(
@@ -99,7 +99,9 @@ def median_ratio(ours: RoundTrips, theirs: RoundTrips, *, seed: int = 0) -> Rati
 
 
 def ratios(ours: Sequence[RoundTrips], theirs: Sequence[RoundTrips]) -> dict[str, dict[str, Any]]:
-    """Return the ratios of all of ours to all of theirs, as JSON: {ours: {theirs: ratio}}."""
+    """Return the ratio of each of our clients to each other client, as JSON: {ours: {theirs:
+    ratio}}.
+    """
     found = {a.name: {b.name: median_ratio(a, b) for b in theirs} for a in ours}
     return {
         a: {b: {"ratio": one.ratio, "ci95": [one.low, one.high]} for b, one in row.items()}
@@ -108,8 +110,8 @@ def ratios(ours: Sequence[RoundTrips], theirs: Sequence[RoundTrips]) -> dict[str
 
 
 def lost_db(images: Mapping[str, np.ndarray], sent: Mapping[str, np.ndarray]) -> float | None:
-    """Return the peak signal-to-noise ratio of all images against what was `sent`, dB; None if
-    they are equal.
+    """Return the peak signal-to-noise ratio of all images relative to the `sent` images, dB; None
+    if they are equal.
     """
     squares = [(images[name].astype(np.float64) - sent[name]) ** 2 for name in sent]
     error = float(np.mean([np.mean(one) for one in squares]))
@@ -120,8 +122,8 @@ PACKAGES = ("vlagents-ray", "ray", "numpy", "torch", "jax", "transformers", "ler
 
 
 def measured_on(program: str = "vlagents-ray") -> dict[str, Any]:
-    """Return date, command, machine and versions as JSON values; call it before measuring, as it
-    has the load.
+    """Return date, command, machine and versions as JSON values; call this before measuring, as the
+    values include the machine's load.
     """
     return {
         "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),

@@ -1,14 +1,13 @@
-"""Robots served in time: how many robots of a rate a server can give their actions, and how old
-those are.
+"""Measures how many robots of a rate a server can serve in time, and the ages of their actions.
 
 The policy takes the time of a real one without computing: a batch of n takes `base + row * n` ms,
 one batch at a time, as on one GPU. Each robot has two 224x224 RGB cameras, executes a row of its
-newest chunk at each of its ticks, and asks for the next chunk in the background. The ticks come
-whatever the server does. A tick without a row is starved; the share in time of a robot is that of
-its other ticks, and a robot is served if its share is at least 98 %.
+newest chunk at each of its ticks, and requests the next chunk in the background. The ticks do not
+wait for the server. A tick without a row is starved. A robot counts as served if at least 98 % of
+its ticks are not starved.
 
-Systems: this server; the same server for clients that do not say how long they can wait; plain Ray
-Serve with `@serve.batch`; openpi's server, shared by all robots, and one for each robot on the same
+Systems: this server; the same server with clients that do not report their slack; plain Ray Serve
+with `@serve.batch`; openpi's server, shared by all robots, and one for each robot on the same
 accelerator; vlagents' server. All robots use the same chunk player.
 """
 
@@ -40,9 +39,9 @@ from vlagents_ray.serve.fleet import CostCurve, RobotNeed, replica_load
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
-CURVES = {  # base and row, ms
-    "pi0": (29.3, 8.06),  # on an H200, compiled
-    "pi0-graphs": (41.5, 10.5),  # on an H200, CUDA graphs
+CURVES = {  # duration of a batch and of each row, ms
+    "pi0": (29.3, 8.06),  # measured on an H200, compiled
+    "pi0-graphs": (41.5, 10.5),  # measured on an H200, CUDA graphs
     "small": (5.0, 0.5),
 }
 OURS, TODAY = "vlagents_ray", "vlagents_ray without slack"
@@ -50,7 +49,7 @@ RAY_SERVE, OPENPI, OPENPI_EACH, VLAGENTS = "ray serve", "openpi", "openpi each",
 SYSTEMS = (OURS, TODAY, RAY_SERVE, OPENPI, OPENPI_EACH, VLAGENTS)
 TRANSPORTS = ("websocket", "http", "shm")
 _METADATA_S = 20.0
-_CLIENTS = {  # by the names of `benchmarks.peers`
+_CLIENTS = {  # clients by the names in `benchmarks.peers`
     RAY_SERVE: "Ray Serve HTTP",
     OPENPI: "openpi",
     OPENPI_EACH: "openpi",
@@ -63,8 +62,8 @@ class Kind:
     """Robots of one kind."""
 
     hz: float
-    rows: int  # that it executes of an answer at most
-    weight: int = 1  # their part of the fleet
+    rows: int  # maximum number of rows of an answer that a robot executes
+    weight: int = 1  # share of the fleet relative to the other kinds
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,17 +73,19 @@ class FleetPlan:
     systems: Sequence[str] = (OURS, TODAY)
     robots: Sequence[int] = (8, 16, 32, 64)
     kinds: Sequence[Kind] = (Kind(10.0, 50),)
-    chunk: int = 50  # rows of an answer
+    chunk: int = 50  # number of rows in an answer
     base_ms: float = 29.3
     row_ms: float = 8.06
     batch: int = 16
-    warm: float = 10.0  # s before each measurement: all robots start at once
-    seconds: float = 20.0  # seconds of each measurement
+    warm: float = 10.0  # time before each measurement, s, as all robots start at once
+    seconds: float = 20.0  # duration of each measurement, s
     transport: str = "websocket"
     real_time_chunking: bool = False
-    link: str | None = None  # rate of an emulated link, as `tc` takes it; None: no link
-    delay: str | None = None  # delay of the link, each way, as `tc` takes it; None adds none
-    python: Path = field(default=others.FOLDER / "bin" / "python")  # python of the peers
+    link: str | None = None  # rate of an emulated link, in the notation of `tc`; None for no link
+    # Delay of the link in each direction, in the notation of `tc`; None adds none.
+    delay: str | None = None
+    # Python interpreter of the other systems.
+    python: Path = field(default=others.FOLDER / "bin" / "python")
 
     def to_json(self) -> dict[str, Any]:
         """Return the settings as JSON values, from which `from_json` makes an equal plan."""
@@ -107,10 +108,10 @@ class FleetPlan:
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Where servers listen, and how robots reach them."""
+    """The address at which servers listen, and the way in which robots reach them."""
 
     host: str = LOOPBACK
-    prefix: Sequence[str] = ()  # words before the command of the robots' processes
+    prefix: Sequence[str] = ()  # words that precede the command of the robots' processes
 
 
 def measure_fleet(
@@ -181,7 +182,9 @@ def _measure_system(
     system: str,
     installed: Mapping[str, others.PeerClient],
 ) -> Iterator[dict[str, Any]]:
-    """Measure a system with all numbers of robots; a server for each robot starts each time."""
+    """Measure a system with all numbers of robots; if each robot has a server, the servers are
+    started each time.
+    """
     if system == OPENPI_EACH:
         for robots in plan.robots:
             with _serving(network, plan, system, robots, installed) as urls:
@@ -217,7 +220,8 @@ def _serving(
             batch={"max_size": plan.batch},
             sessions={"limit": 2 * max(plan.robots)},
         )
-        # Without keys: another host than loopback is one end of a link that only this run uses.
+        # No keys are needed: a host other than loopback is one end of a link that only this run
+        # uses.
         is_open = network.host != LOOPBACK
         with running_server(config, host=network.host, insecure=is_open) as server:
             yield [server.url] * robots
@@ -281,7 +285,8 @@ def _point(network: Network, plan: FleetPlan, system: str, urls: Sequence[str]) 
     }
     kinds = plan.fleet(robots)
     if system in (OURS, TODAY):
-        # The load by what the server has measured: batches take longer than the policy alone.
+        # The load follows from what the server has measured: batches take longer than the policy
+        # alone.
         batch_ms = batch_ms_of(urls[0])
         point["batch_ms"] = batch_ms
         if batch_ms:
@@ -305,7 +310,7 @@ def batch_ms_of(url: str) -> dict[str, float]:
 
 
 def most_served(points: Sequence[Mapping[str, Any]], system: str) -> int:
-    """Return the largest number of robots that a system served, each of them in time."""
+    """Return the largest number of robots with which a system served each robot in time."""
     served = [
         point["robots"]
         for point in points
@@ -351,7 +356,7 @@ def show_fleet(measured: Mapping[str, Any]) -> None:
 
 
 def parse_kinds(text: str) -> list[Kind]:
-    """Parse HZ:ROWS or HZ:ROWS:WEIGHT with commas between them."""
+    """Parse a comma-separated list of HZ:ROWS or HZ:ROWS:WEIGHT."""
     kinds = []
     for kind in parse_list(text):
         numbers = kind.split(":")
@@ -370,26 +375,33 @@ def main(
     ] = f"{OURS},{TODAY}",
     robots: Annotated[str, typer.Option(help="Numbers of robots.")] = "8,16,32,64",
     kinds: Annotated[
-        str, typer.Option(help="Robots as HZ:ROWS or HZ:ROWS:WEIGHT; they take turns.")
+        str,
+        typer.Option(help="Kinds of robots as HZ:ROWS or HZ:ROWS:WEIGHT, which are interleaved."),
     ] = "10:50",
-    chunk: Annotated[int, typer.Option(min=1, help="Rows of an answer.")] = 50,
+    chunk: Annotated[int, typer.Option(min=1, help="Number of rows in an answer.")] = 50,
     curve: Annotated[
         str, typer.Option(help=f"One of {', '.join(CURVES)}, or BASE:ROW in ms.")
     ] = "pi0",
     batch: Annotated[int, typer.Option(min=1, help="Largest batch.")] = 16,
     warm: Annotated[
-        float, typer.Option(min=0, help="Seconds before each: all robots start at once.")
+        float,
+        typer.Option(min=0, help="Seconds before each measurement, as all robots start at once."),
     ] = 10.0,
     seconds: Annotated[float, typer.Option(min=1, help="Of each measurement.")] = 20.0,
     transport: Annotated[str, typer.Option(help="websocket, http or shm.")] = "websocket",
-    rtc: Annotated[bool, typer.Option("--rtc", help="Send the rest of the plan.")] = False,
+    rtc: Annotated[
+        bool, typer.Option("--rtc", help="Send the remaining rows of the plan with each request.")
+    ] = False,
     link: Annotated[
         str | None,
         typer.Option(help="Rate of an emulated link to the robots, as tc writes it: 1gbit."),
     ] = None,
     delay: Annotated[
         str | None,
-        typer.Option(help="Of the link, each way, as tc writes it: 2ms. Needs the kernel's netem."),
+        typer.Option(
+            help="Delay of the link in each direction, as tc writes it: 2ms. Needs the "
+            "kernel's netem."
+        ),
     ] = None,
     peers_python: others.PeersPython = others.PYTHON,
     out_file: Out = None,

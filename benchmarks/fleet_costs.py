@@ -1,10 +1,10 @@
-"""Costs that grow with a fleet, each measured alone in seconds: those that `fleet_simulation`
-computes its limits from.
+"""Measures the costs that grow with a fleet, each separately and in seconds. `fleet_simulation`
+computes its limits from them.
 
 `python -m benchmarks.fleet_costs` prints them: a request in the batch queue and in the pace of the
 robots, the reports of robots, the decision of autoscaling in Ray Serve's controller, and HAProxy's
-idle connections and health checks. It starts no cluster. Ray's own code is called as its controller
-calls it.
+idle connections and health checks. It starts no cluster, but calls Ray's own code in the same way
+as Ray's controller.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from vlagents_ray.serve.queue.replica_pace import ReplicaPace, RobotPlan
 from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 from vlagents_ray.serve.scaling.autoscaling import MeasuredLoad
 
-_ROUNDS = 5  # rounds of each measurement; the fastest one counts
+_ROUNDS = 5  # number of rounds of each measurement; the fastest round counts
 _STATS = ("utilisation", "waiting", "sessions", "slo_load", "slo_robots", "late_robots")
 _CONNECTIONS = 2000
-_CHECKED = 400  # replicas whose health one proxy checks
+_CHECKED = 400  # number of replicas whose health one proxy checks
 _CHECKED_S = 5.0
 
 
@@ -60,14 +60,14 @@ class Cost:
 
 
 class _EverySession:
-    """The sessions of a replica: all that a request names."""
+    """The sessions of a replica, which has every session that a request names."""
 
     def __contains__(self, session_id: object) -> bool:
         return True
 
 
 class _NoFiles:
-    """In place of the poller: nothing is read from files here."""
+    """Replaces the poller, as nothing is read from files here."""
 
     def wake(self) -> None:
         pass
@@ -76,7 +76,7 @@ class _NoFiles:
 
 
 def fastest_s(call: Callable[[], Any], times: int) -> float:
-    """Return the duration of a call, s: that of the fastest of some rounds of `times` calls."""
+    """Return the duration of a call in the fastest of some rounds of `times` calls, s."""
     rounds = []
     for _ in range(_ROUNDS):
         began = time.perf_counter()
@@ -87,7 +87,7 @@ def fastest_s(call: Callable[[], Any], times: int) -> float:
 
 
 def queue_cost(waiting: int) -> Cost:
-    """Measure a request in the batch queue, among others that wait."""
+    """Measure a request in the batch queue, among other waiting requests."""
     now = 0.0
     queue = BatchQueue(
         16,
@@ -120,7 +120,7 @@ def queue_cost(waiting: int) -> Cost:
 
     for _ in range(waiting):
         add()
-    for _ in range(50):  # until the costs of batches are known
+    for _ in range(50):  # repeated until the costs of batches are known
         turn()
     return Cost(
         f"a request in the batch queue, {waiting} robots wait",
@@ -130,13 +130,13 @@ def queue_cost(waiting: int) -> Cost:
 
 
 def pace_cost(robots: int) -> Cost:
-    """Measure the pace of a robot in an answer, among those of the replica."""
+    """Measure the computation of a robot's pace in an answer, among all robots of the replica."""
     now = 0.0
     need = RobotNeed(10.0, 50)
     plans = [RobotPlan(need, is_stated=True) for _ in range(robots)]
     costs = CostCurve(0.0293, 0.00806)
     pace = ReplicaPace(lambda: costs, lambda: plans, 16, lambda: now, lambda: 3)
-    answers_hz = robots / 4.0  # the plans of all are read twice a second
+    answers_hz = robots / 4.0  # the plans of all robots are read twice a second
     numbers = iter(range(10**9))
 
     def answer() -> None:
@@ -179,12 +179,14 @@ def goodput_cost(robots: int) -> Cost:
 
 
 def decision_cost(replicas: int) -> Cost:
-    """Measure one decision of autoscaling in Serve's controller, which makes ten a second."""
+    """Measure one decision of autoscaling in Serve's controller, which makes ten decisions a
+    second.
+    """
     deployment = DeploymentID("Policy", "app")
     settings = AutoscalingArgs(min_replicas=1, max_replicas=replicas)
     config = AutoscalingConfig(**settings.options())
     state = DeploymentAutoscalingState(deployment)
-    state._config, state._policy = config, MeasuredLoad()  # as `register` does
+    state._config, state._policy = config, MeasuredLoad()  # the same assignment as in `register`
     ids = [ReplicaID(f"replica{number}", deployment) for number in range(replicas)]
     state.update_running_replica_ids(ids)
     now = time.time()
@@ -243,7 +245,7 @@ def _haproxy(front: int, servers: str) -> Iterator[int]:
 
 
 async def _answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Answer as a replica: accept a WebSocket and keep it, or say that all is well."""
+    """Answer like a replica: accept a WebSocket and keep it, or report good health."""
     head = await reader.readuntil(b"\r\n\r\n")
     if b"Upgrade" in head:
         writer.write(

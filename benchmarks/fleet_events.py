@@ -1,8 +1,9 @@
-"""What robots miss when a replica is killed, when weights are pushed, and when more robots come.
+"""Measures what robots miss when a replica is killed, when weights are pushed, and when more robots
+come.
 
 Robots of `benchmarks.fleet` run for all of these events, one after the other, on two replicas of a
-policy that takes the time of a real one. Ticks are open loop: they come whatever the server does. A
-killed replica is replaced by Ray Serve, and the sessions of its robots begin again elsewhere.
+policy that takes the time of a real one. Ticks are open loop: they do not wait for the server. Ray
+Serve replaces a killed replica, and the sessions of its robots begin again at another replica.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray_cluster.tune.line_process import LineProcess
 from vlagents_ray_learn import Publisher
 
-_PARAMETERS = 30_000_000  # parameters of the pushed model
+_PARAMETERS = 30_000_000  # number of parameters of the pushed model
 _AHEAD_S = 1.0
 _LATE_S = 60.0
-_LOOK_S = 1.0  # time before the next event at which sessions are counted
-_SETTLE_S = 10.0  # before the first event
-IN_TIME = 0.98  # share of the ticks of a second in which a fleet counts as in time
+_LOOK_S = 1.0  # time before the next event at which sessions are counted, s
+_SETTLE_S = 10.0  # time before the first event, s
+IN_TIME = 0.98  # minimum share of the ticks of a second with which a fleet counts as in time
 
 
 class TimedConfig(TrainedConfig):
@@ -51,7 +52,7 @@ class TimedConfig(TrainedConfig):
 
 
 class Timed(Trained):
-    """Returns chunks of zeros after `base_ms` a batch and `per_item_ms` an observation."""
+    """Returns chunks of zeros after `base_ms` per batch and `per_item_ms` per observation."""
 
     Config = TimedConfig
     config: TimedConfig
@@ -70,30 +71,30 @@ class EventPlan:
     """The settings of `measure_events`."""
 
     robots: int = 48
-    joining: int = 16  # robots that come at once
+    joining: int = 16  # number of robots that come at once
     hz: float = 10.0
-    rows: int = 50  # rows of an answer
+    rows: int = 50  # number of rows in an answer
     base_ms: float = 29.3
     row_ms: float = 8.06
     replicas: int = 2
     batch: int = 16
     transport: str = "websocket"
-    gap_s: float = 30.0  # between two events
+    gap_s: float = 30.0  # time between two events, s
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What happened, and when."""
+    """An event, and its time."""
 
     name: str
-    at_s: float  # after the robots' begin
-    robots: int  # that run afterwards
+    at_s: float  # time after the robots' beginning, s
+    robots: int  # number of robots that run after the event
 
 
 def measure_events(
     plan: EventPlan, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Let all events happen to a fleet; returns plain JSON values."""
+    """Cause all events in a fleet, and return plain JSON values."""
     config = {
         "parameters": _PARAMETERS,
         "dtype": "float16",
@@ -118,14 +119,15 @@ def measure_events(
         joining = start_robots(stack, [robot] * plan.joining)
         begin = time.monotonic() + _AHEAD_S
         app = document.applications[0].name
-        sessions: list[list[int]] = []  # sessions of the replicas, at the end of each event
+        # Numbers of sessions of the replicas at the end of each event.
+        sessions: list[list[int]] = []
         moments = [_SETTLE_S + number * plan.gap_s for number in range(4)]
         end_s = moments[-1]
         _send(running, begin, begin + end_s)
         _send(joining, begin + moments[2], begin + end_s)
 
         def wait_until(moment_s: float) -> None:
-            """Wait until shortly before that moment, and look at the replicas then."""
+            """Wait until shortly before this time, and then record the replicas' sessions."""
             time.sleep(max(0.0, begin + moment_s - _LOOK_S - time.monotonic()))
             sessions.append(sessions_of_replicas(app))
             progress(f"sessions of the replicas: {sessions[-1]}")
@@ -178,9 +180,9 @@ def summary(event: Event, until_s: float, late: Iterable[float], hz: float) -> d
 
     Args:
         event: The event.
-        until_s: The end of its time, s after the robots' begin, as all times.
+        until_s: The end of the event's period; all times are in s after the robots' beginning.
         late: The times of all robots' starved ticks.
-        hz: Ticks of a robot a second.
+        hz: Ticks of a robot per second.
     """
     missed = sorted(moment_s for moment_s in late if event.at_s <= moment_s < until_s)
     each_second = event.robots * hz
@@ -229,8 +231,8 @@ def show_events(measured: Mapping[str, Any]) -> None:
 
 def main(
     robots: Annotated[int, typer.Option(min=1)] = 48,
-    joining: Annotated[int, typer.Option(min=1, help="Robots that come at once.")] = 16,
-    rows: Annotated[int, typer.Option(min=2, help="Rows of an answer.")] = 50,
+    joining: Annotated[int, typer.Option(min=1, help="Number of robots that come at once.")] = 16,
+    rows: Annotated[int, typer.Option(min=2, help="Number of rows in an answer.")] = 50,
     curve: Annotated[str, typer.Option(help=f"One of {', '.join(CURVES)}.")] = "pi0",
     transport: Annotated[str, typer.Option(help="websocket or http.")] = "websocket",
     gap: Annotated[float, typer.Option(min=10, help="Seconds between two events.")] = 30.0,

@@ -1,8 +1,8 @@
-"""The picture and the table of several measurements of `benchmarks.fleet`.
+"""Makes the picture and the table of several measurements of `benchmarks.fleet`.
 
 `python -m benchmarks.fleet_page FILE... --picture docs/pictures/fleet.svg` prints the table as
-Markdown. Files that measured the same robots, such as other systems, share a panel. The
-points of the picture are stored beside it, in a file .json.
+Markdown. Files with measurements of the same robots, such as those of other systems, share a panel.
+The points of the picture are stored next to it, in a .json file.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SAME = (
 
 
 def merge_fleets(files: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return a fleet for each sort of robots, with the points of all files that measured it."""
+    """Return a fleet for each kind of robots, with the points of all files that measured it."""
     fleets: dict[str, dict[str, Any]] = {}
     for measured in files:
         plan = measured["plan"]
@@ -59,7 +59,9 @@ def title(plan: Mapping[str, Any]) -> str:
 
 
 def most(plan: Mapping[str, Any]) -> int | None:
-    """Return the largest number of robots by arithmetic; None for robots of several kinds."""
+    """Return the largest number of robots that is possible by arithmetic; None for robots of
+    several kinds.
+    """
     if len(plan["kinds"]) > 1:
         return None
     kind = plan["kinds"][0]

@@ -1,12 +1,11 @@
-"""Plans of fleets against what their robots get: the share of ticks in time that
-`vlagents-ray plan` predicts, that of its simulation, and that of robots at real servers.
+"""Compares plans of fleets with measurements: the share of ticks in time that `vlagents-ray plan`
+predicts, the share in its simulation, and the share of robots at real servers.
 
 `python -m benchmarks.fleet_plans` measures ten fleets: each model is served with the replicas,
 batches and shares of a GPU of the plan, by a policy that takes the time of the cost curve without
-computing, and each robot runs with two cameras in a separate process kind, as in
-`benchmarks.fleet`. `--files` measures files of fleets instead. `--loads` measures nothing: it
-simulates one replica with as many robots as different loads allow, from which the default of
-`max_load` was chosen.
+computing, and each robot has two cameras and runs in other processes, as in `benchmarks.fleet`.
+`--files` measures files of fleets instead. `--loads` measures nothing. It simulates one replica
+with as many robots as different loads allow; the default of `max_load` was chosen from its results.
 """
 
 from __future__ import annotations
@@ -33,8 +32,9 @@ from vlagents_ray_fleet.fleet_file import FleetFile, read_fleet
 from vlagents_ray_fleet.plan import Demand, FleetPlan, ModelPlan, plan
 from vlagents_ray_fleet.simulation import Tally, World, starved_streams
 
-PI0 = {"costs": {"fixed_ms": 29.3, "row_ms": 8.06}, "memory_gb": 9}  # on an H200, compiled
-GRAPHS = {"costs": {"fixed_ms": 41.5, "row_ms": 10.5}, "memory_gb": 8}  # the same, CUDA graphs
+PI0 = {"costs": {"fixed_ms": 29.3, "row_ms": 8.06}, "memory_gb": 9}  # measured on an H200, compiled
+# Measured on an H200, CUDA graphs.
+GRAPHS = {"costs": {"fixed_ms": 41.5, "row_ms": 10.5}, "memory_gb": 8}
 SMALL = {"costs": {"fixed_ms": 5, "row_ms": 0.5}, "memory_gb": 2, "max_batch_size": 32}
 PLANNER = {"costs": {"fixed_ms": 90, "row_ms": 30}, "memory_gb": 18, "max_batch_size": 8}
 # A replica has at least half of a GPU, so that few processes share the CPUs of this machine.
@@ -63,7 +63,8 @@ FLEETS: Mapping[str, Mapping[str, Any]] = {
         },
         "models": {"pi0": PI0, "planner": PLANNER},
     },
-    # Replicas with loads of 0.6 to 0.8: few robots that ask often, or whose model is slow.
+    # Replicas with loads of 0.6 to 0.8: few robots that send frequent requests, or whose model is
+    # slow.
     "short chunks, full": {"robots": {"arms": _robots(40, 10, 8)}, "models": {"pi0": PI0}},
     "fresh actions, full": {
         "robots": {"arms": _robots(31, 10, 16, age_ms=900)},
@@ -98,13 +99,14 @@ KINDS: Mapping[str, tuple[CostCurve, int, RobotNeed]] = {
 }
 LOADS = (0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 1.0)
 _SEEDS = 3
-_START_S, _SIMULATED_S = 3.0, 60.0  # within which all robots start; after it
+# Time within which all robots start, s, and the simulated time after it, s.
+_START_S, _SIMULATED_S = 3.0, 60.0
 _TRANSPORT_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """The robots of a group at one model: what was predicted, simulated and measured."""
+    """The predicted, simulated and measured figures of the robots of one group and one model."""
 
     fleet: str
     model: str
@@ -120,7 +122,7 @@ class Comparison:
 
     @property
     def points(self) -> float:
-        """The error of the predicted share, in points of a hundred."""
+        """The error of the predicted share, in percentage points."""
         return 100 * abs(self.predicted_share - self.measured_share)
 
 
@@ -188,7 +190,7 @@ def deployed(solved: FleetPlan) -> Deployment:
                     "replicas": model.replicas,
                     "batch": {"max_size": model.batch_size},
                     "sessions": {"limit": 2 * demand.robots},
-                    "resources": {"num_cpus": 0},  # these policies only wait
+                    "resources": {"num_cpus": 0},  # these policies only sleep
                 },
             }
         )
@@ -196,8 +198,8 @@ def deployed(solved: FleetPlan) -> Deployment:
 
 
 def line_of(costs: CostCurve, model: ModelPlan) -> tuple[float, float]:
-    """Return the fixed duration of a batch and that of a row, s, of the line through a curve up to
-    the batches of a plan.
+    """Fit a line to a curve up to the batch size of a plan; return the fixed duration of a batch
+    and the duration of a row, s.
     """
     if not costs.table:
         return costs.fixed_s, costs.row_s
@@ -214,8 +216,8 @@ def _chunk(demand: Demand) -> int:
 
 
 def robots_of(demand: Demand, url: str, transport: str) -> list[Robot]:
-    """Return the robots that use a model, group by group; a robot with two models is two here, as
-    these are two sessions with their own rates.
+    """Return the robots that use a model, group by group; a robot with two models counts as two, as
+    it has two sessions with separate rates.
     """
     robots = []
     for use in demand.uses:
@@ -234,7 +236,9 @@ def robots_of(demand: Demand, url: str, transport: str) -> list[Robot]:
 
 
 def most_robots(costs: CostCurve, need: RobotNeed, largest_batch: int, load: float) -> int:
-    """Return the largest number of equal robots whose load of a replica is at most `load`."""
+    """Return the largest number of equal robots with which the load of a replica is at most
+    `load`.
+    """
 
     def fits(robots: int) -> bool:
         return replica_load(costs, {need: robots}, largest_batch, _TRANSPORT_S).load <= load
@@ -251,8 +255,8 @@ def most_robots(costs: CostCurve, need: RobotNeed, largest_batch: int, load: flo
 def simulate(
     costs: CostCurve, largest_batch: int, need: RobotNeed, robots: int, seed: int
 ) -> dict[str, float]:
-    """Simulate one replica with equal robots; return the share of all ticks, and the share of the
-    robots of which at least 98 % of their own were in time.
+    """Simulate one replica with equal robots; return the share of all ticks in time, and the share
+    of robots that had at least 98 % of their ticks in time.
     """
     world = World(seed)
     world.add_replica("model", costs, largest_batch)
@@ -270,7 +274,9 @@ def simulate(
 def simulate_loads(
     loads: Sequence[float] = LOADS, progress: Callable[[str], None] = lambda _: None
 ) -> list[dict[str, Any]]:
-    """Simulate a replica at different loads with each kind of robots; the worst of some seeds."""
+    """Simulate a replica at different loads with each kind of robots, and return the worst result
+    of some seeds.
+    """
     rows = []
     for kind, (costs, largest_batch, need) in KINDS.items():
         for load in loads:
@@ -340,10 +346,11 @@ def show_loads(rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def main(
-    files: Annotated[str, typer.Option(help="Files of fleets, with commas between them.")] = "",
+    files: Annotated[str, typer.Option(help="Files of fleets, separated by commas.")] = "",
     seconds: Seconds = 20.0,
     warm: Annotated[
-        float, typer.Option(min=0, help="Before each measurement: all robots start at once, s.")
+        float,
+        typer.Option(min=0, help="Seconds before each measurement, as all robots start at once."),
     ] = 10.0,
     transport: Annotated[str, typer.Option(help="websocket, http or shm.")] = "websocket",
     loads: Annotated[
@@ -351,7 +358,7 @@ def main(
     ] = False,
     out_file: Out = None,
 ) -> None:
-    """Compare the plans of fleets with what their robots get."""
+    """Compare the plans of fleets with measurements of their robots."""
     with errors():
         if transport not in ("websocket", "http", "shm"):
             raise ConfigError(f"--transport: expected websocket, http or shm, got {transport!r}")

@@ -1,9 +1,9 @@
 """Robots that execute the chunks of a policy at their rate: `python -m benchmarks.fleet_robots
 JSON`.
  The process connects its robots, and writes "ready". Each line that it then reads is a run,
-{"begin": s, "counted": s, "end": s} of `time.monotonic`; at the end it writes what happened at each
-robot's ticks from `counted` on. A robot whose policy is late holds still at that tick, and
-continues at the next one: the load does not slow down with the server.
+{"begin": s, "counted": s, "end": s} of `time.monotonic`; at the end it writes the figures of each
+robot's ticks since `counted`. A robot whose policy is late holds still at that tick, and continues
+at the next tick: the load does not decrease when the server is slow.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from vlagents_ray.testing import random_observation
 
 CONNECT_S = 120.0
 TIMEOUT_S = 20.0
-_AGES = 2000  # most ages of a robot that are written
-_IMAGE_SIZE = 224  # px, of cameras whose size the contract leaves open
+_AGES = 2000  # maximum number of ages of a robot that are written
+_IMAGE_SIZE = 224  # size of cameras for which the contract has no size, px
 _OPENPI_KEYS = {
     "cameras": {"camera_0": "observation/image", "camera_1": "observation/wrist_image"},
     "state": {"joints": "observation/state"},
@@ -56,19 +56,21 @@ class Robot:
 
     url: str
     hz: float
-    chunk: int  # rows of an answer
-    rows: int | None = None  # rows of an answer that it executes at most; None: all
-    way: str = "websocket"  # way of our client; else "openpi", "vlagents", "ray serve"
-    states_slack: bool = True  # whether the server learns how long the answer can wait
+    chunk: int  # number of rows in an answer
+    # Maximum number of rows of an answer that the robot executes; None for all.
+    rows: int | None = None
+    way: str = "websocket"  # transport of our client; otherwise "openpi", "vlagents" or "ray serve"
+    states_slack: bool = True  # whether the robot reports how long it can wait for an answer
     real_time_chunking: bool = False
-    age_ms: float | None = None  # largest age of an action in its SLO
-    share: float = 0.98  # share of its ticks that its SLO wants in time
-    # Whether its observations fit the contract of the policy; else two cameras and seven joints.
+    age_ms: float | None = None  # maximum age of an action in the robot's SLO
+    share: float = 0.98  # share of ticks in time in the robot's SLO
+    # Whether the observations fit the contract of the policy; otherwise they have two cameras and
+    # seven joints.
     fits_contract: bool = False
 
 
 class WithoutSlack(Agent):
-    """A client of ours as it was before servers knew of slack."""
+    """Our client as it was before servers used slack."""
 
     def __init__(self, agent: Agent) -> None:
         self._agent = agent
@@ -98,7 +100,7 @@ class RayServeClient(Agent):
     """A client of plain Ray Serve with `@serve.batch`, `benchmarks/peers/ray_serve_peer.py`."""
 
     def __init__(self, url: str, chunk: int) -> None:
-        import requests  # robots of other servers need none of it
+        import requests  # robots of other servers do not need this module
 
         self._url, self._chunk = url, chunk
         self._connection = requests.Session()
@@ -158,7 +160,7 @@ class RunningRobot:
             horizon=robot.rows,
             real_time_chunking=robot.real_time_chunking,
             timeout_s=TIMEOUT_S,
-            # No arm moves, but the player rejects what does not fit the policy's actions.
+            # The arm does not move, but the player rejects actions that do not fit the contract.
             safe="zero" if is_relative else "hold",
         )
         self._player = ChunkPlayer(agent, settings)
@@ -169,12 +171,13 @@ class RunningRobot:
             self._obs = with_photographs(obs, seed=0)
 
     def run(self, begin: float, counted: float, end: float) -> dict[str, Any]:
-        """Run from a random moment within a period of `begin` until `end`; returns the figures.
+        """Run from a random moment within a period after `begin` until `end`, and return the
+        figures.
 
         Args:
-            begin: The begin of the episode, s of `time.monotonic`, as all times.
-            counted: From when on ticks are counted: a fleet that starts at once has other figures
-                than one that runs.
+            begin: The beginning of the episode; all times are s of `time.monotonic`.
+            counted: The time since which ticks are counted, as the figures of a starting fleet
+                differ from those of a running fleet.
             end: The end of the run.
         """
         robot = self._robot
@@ -184,8 +187,9 @@ class RunningRobot:
         time.sleep(max(0.0, begin + random.uniform(0, 1 / robot.hz) - time.monotonic()))
         failed = ""
         ages: list[float] = []
-        resumed: set[int] = set()  # chunks before which the session had to begin again
-        late: list[tuple[float, int]] = []  # moments of starved ticks, s after `begin`
+        resumed: set[int] = set()  # number of chunks before which the session had to begin again
+        # Times of starved ticks, s after `begin`, and their numbers.
+        late: list[tuple[float, int]] = []
         try:
             reset = self._player.reset(replace(self._obs, info={}), "measure", **options)
         except VLAgentsError as error:
@@ -199,7 +203,7 @@ class RunningRobot:
                 "failed": str(error),
             }
 
-        # A robot that still waits for its first answer holds.
+        # A robot holds still while it waits for its first answer.
         waited_s = max(0.0, min(time.monotonic(), end) - counted)
         ticks = starved = round(waited_s * robot.hz)
         pacer = Pacer(robot.hz)

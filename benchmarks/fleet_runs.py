@@ -17,7 +17,7 @@ from benchmarks.fleet_robots import CONNECT_S, Robot
 from benchmarks.processes import cpu_seconds, server_processes
 from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
-SERVED = 0.98  # share in time of a robot that counts as served
+SERVED = 0.98  # minimum share of ticks in time of a robot that counts as served
 _AHEAD_S = 0.5
 _LATE_S = 90.0
 _ROBOTS_A_PROCESS = 16
@@ -25,7 +25,7 @@ _ROBOTS_A_PROCESS = 16
 
 @dataclass(frozen=True, slots=True)
 class RobotsRun:
-    """The figures of robots, and the CPU time that they and their servers took, s."""
+    """The figures of robots, and the CPU time of robots and servers, s."""
 
     figures: Sequence[Mapping[str, Any]]  # figures of each robot
     client_cpu_s: float
@@ -35,7 +35,7 @@ class RobotsRun:
 def run_robots(
     fleet: Sequence[Robot], warm: float, seconds: float, prefix: Sequence[str] = ()
 ) -> RobotsRun:
-    """Run robots in separate processes, all of which begin at once.
+    """Run robots in separate processes, which all begin at the same time.
 
     Args:
         fleet: The robots.
@@ -87,13 +87,15 @@ def start_robots(
 def _cpu_s(pids: Sequence[int]) -> float:
     seconds = 0.0
     for pid in pids:
-        with contextlib.suppress(OSError):  # it has ended
+        with contextlib.suppress(OSError):  # the process has ended
             seconds += cpu_seconds(pid)
     return seconds
 
 
 def summary(robots: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the figures of some robots: the share of their ticks, and the ages of actions, ms."""
+    """Return the figures of some robots: the share of ticks in time, and the ages of actions,
+    ms.
+    """
     shares = [1 - robot["starved"] / max(1, robot["ticks"]) for robot in robots]
     ticks = sum(robot["ticks"] for robot in robots)
     starved = sum(robot["starved"] for robot in robots)

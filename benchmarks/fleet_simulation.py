@@ -1,9 +1,9 @@
-"""Ten thousand robots on 400 replicas and 50 nodes, in virtual time: what they get through a
-morning, losses and a rolling update, and which limit is reached first.
+"""Simulates ten thousand robots on 400 replicas and 50 nodes in virtual time: their ticks in time
+during a morning, losses and a rolling update, and which limit is reached first.
 
 `python -m benchmarks.fleet_simulation` prints it; `--json FILE` also writes it. It needs no GPU,
-and minutes of one core for each scenario. The simulation is that of `vlagents-ray plan --check`;
-each printed limit names the measurement or the setting that it was computed from.
+and some minutes of one core for each scenario. The simulation is that of `vlagents-ray plan
+--check`; each printed limit names the measurement or the setting that it was computed from.
 """
 
 from __future__ import annotations
@@ -36,59 +36,61 @@ MODEL = "pi0"
 COSTS = CostCurve(0.0293, 0.00806)  # pi0 compiled, on an H200 (docs/measured_gpu.md)
 LARGEST_BATCH = 16
 TRANSPORT_S = 0.005
-# Start of a replica. On an H200 with its compiled programs kept it takes 50 s
-# (docs/measured_gpu.md), but nothing changes meanwhile.
+# Start of a replica, s. With kept compiled programs it takes 50 s on an H200
+# (docs/measured_gpu.md), but nothing else happens in that time.
 START_S = 20.0
-MORNING_S = 60.0  # within which all robots start
-STEADY_S = 15.0  # time of the event; all robots have started within 5 s
-REPAIR_S = 30.0  # after which lost machines are back
-UPDATED_AT_ONCE = 0.2  # share of the replicas: Ray Serve's rolling_update_percentage
-DRAIN_S = 5.0  # within which the sessions of a leaving replica have moved
-RACKS = 5  # with equal numbers of nodes
+MORNING_S = 60.0  # time within which all robots start, s
+STEADY_S = 15.0  # time of the event, s; all robots have started within 5 s
+REPAIR_S = 30.0  # time after which lost machines are back, s
+# Share of the replicas that are replaced at once, Ray Serve's rolling_update_percentage.
+UPDATED_AT_ONCE = 0.2
+DRAIN_S = 5.0  # time within which the sessions of a leaving replica have moved, s
+RACKS = 5  # number of racks, with equal numbers of nodes
 IN_TIME = 0.98
 
-# Measured inputs of the limits, with their sources.
-SERVER_MS_AN_ACT = 1.226  # WebSocket with JPEG, CPU of the replica (docs/measured_tables.md)
-PROXY_MS_A_REQUEST = 0.235  # HAProxy's CPU of a request by HTTP (docs/measured_tables.md)
+# Measured inputs of the limits, with their sources
+SERVER_MS_AN_ACT = 1.226
+PROXY_MS_A_REQUEST = 0.235  # HAProxy's CPU for a request over HTTP (docs/measured_tables.md)
 # CPU of Ray Serve's controller, and of one replica without sessions, in cores, by the number of
 # replicas: 30 s each on two cores of an Intel Xeon, Ray 2.60.0, without autoscaling.
 CONTROLLER_CORES = {2: 0.0420, 12: 0.0450}
 REPLICA_CORES = {2: 0.0180, 12: 0.0220}
-PROXY_CONNECTIONS = 16_384  # vlagents_ray.serve.launch.haproxy
-CONNECTIONS_OF_AN_ADDRESS = 1_000  # the same
-COMPARE_S = 3.0  # vlagents_ray.serve.scaling.rebalancer.PERIOD_S
-MOST_ASKED = 32  # vlagents_ray.serve.scaling.sibling_replicas
-# By `python -m benchmarks.fleet_costs`.
+PROXY_CONNECTIONS = 16_384  # set in vlagents_ray.serve.launch.haproxy
+CONNECTIONS_OF_AN_ADDRESS = 1_000  # set in the same module
+COMPARE_S = 3.0  # the value of vlagents_ray.serve.scaling.rebalancer.PERIOD_S
+MOST_ASKED = 32  # as in vlagents_ray.serve.scaling.sibling_replicas
+# Measured by `python -m benchmarks.fleet_costs`.
 DECISION_MS = {400: 7.4}  # one decision of autoscaling, by the number of replicas
 DECISIONS_HZ = 10.0
 OPENING_MS = 0.12  # HAProxy's CPU to open a WebSocket
 CHECKED_REPLICAS = 400
-CHECKING_CORES = 0.076  # HAProxy's CPU for their health checks
+CHECKING_CORES = 0.076  # HAProxy's CPU for the health checks, by the number of replicas
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the robots got from the event of a scenario on."""
+    """The service of the robots since the event of a scenario."""
 
     scenario: str
     share: float  # share of ticks in time
-    worst_share: float  # share of the worst second
-    in_time_s: float  # after the event, until at least 98 % of ticks are in time in each second
-    all_in_time_s: float  # until at least 98 % of the further ticks of each robot are in time
-    late_robots: int  # with less than 98 % of all their ticks in time
-    moves: int  # moves of sessions
-    most_sessions: int  # largest number of sessions of one replica, at the end
+    worst_share: float  # share of ticks in time in the worst second
+    # Time after the event until, in each second, at least 98 % of ticks are in time, s.
+    in_time_s: float
+    all_in_time_s: float  # time until at least 98 % of the later ticks of each robot are in time, s
+    late_robots: int  # number of robots with less than 98 % of all their ticks in time
+    moves: int  # number of moved sessions
+    most_sessions: int  # largest number of sessions of a replica at the end
     requests: int
     cpu_s: float
 
 
 @dataclass(frozen=True)
 class Limit:
-    """One part of the system, and how many robots it carries."""
+    """One part of the system, and the number of robots that it can serve."""
 
     part: str
     used: str
-    limit_robots: float | None  # None: it does not grow with the fleet
+    limit_robots: float | None  # number of robots; None if the use does not grow with the fleet
     source: str
 
 
@@ -104,7 +106,7 @@ class Shape:
 
     @property
     def need(self) -> RobotNeed:
-        """What each robot needs."""
+        """The need of each robot."""
         return RobotNeed(self.hz, self.rows)
 
     @property
@@ -115,15 +117,16 @@ class Shape:
 
 @dataclass(frozen=True)
 class Scenario:
-    """A fleet to which something happens."""
+    """A fleet, and an event that happens to it."""
 
     name: str
     until_s: float
     happens: Callable[[World, Shape], None] | None = None
-    begun_s: float = STEADY_S  # time of the event
-    begin_within_s: float = 5.0  # time within which all robots start
-    least_loaded: bool = True  # else sessions are placed by a hash
-    replicas: float = 1.0  # share of the replicas that run at first
+    begun_s: float = STEADY_S  # time of the event, s
+    begin_within_s: float = 5.0  # time within which all robots start, s
+    # Whether sessions are placed at the least loaded replica; otherwise by a hash.
+    least_loaded: bool = True
+    replicas: float = 1.0  # share of the replicas that run at the beginning
 
 
 def run(scenario: Scenario, shape: Shape, seed: int = 0) -> tuple[Tally, World]:
@@ -141,7 +144,8 @@ def run(scenario: Scenario, shape: Shape, seed: int = 0) -> tuple[Tally, World]:
     world.at(0.0, world.compare, MODEL, 0)
     if scenario.happens is not None:
         world.at(scenario.begun_s, partial(scenario.happens, world), shape, 0)
-    # There are no cycles, and a collection takes longer the more robots there are.
+    # Garbage collection is off: there are no cycles, and a collection takes longer with more
+    # robots.
     gc.disable()
     try:
         world.run(scenario.until_s)
@@ -156,14 +160,14 @@ def _lose_node(world: World, _: Shape, __: int = 0) -> None:
 
 
 def _lose_rack(world: World, shape: Shape, _: int = 0) -> None:
-    """Lose the machines of a rack, which are back after 30 s."""
+    """Lose the machines of a rack, which return after 30 s."""
     rack = range(shape.nodes // RACKS)
     _lose(world, rack)
     world.at(world.now + REPAIR_S, partial(_repair, world), rack, 0)
 
 
 def _lose(world: World, nodes: Sequence[int]) -> None:
-    """Lose machines: nothing ends the connections to their replicas."""
+    """Lose machines; the connections to their replicas are not closed."""
     for replica in world.replicas[MODEL]:
         if replica.node in nodes and replica.alive:
             replica.fail(world.behaviour.silent_s)
@@ -243,9 +247,9 @@ SCENARIOS: Mapping[str, Scenario] = {
 
 
 def outcome(scenario: Scenario, tally: Tally, world: World, cpu_s: float) -> Outcome:
-    """Return what the robots got from the event on."""
+    """Return the service of the robots since the event."""
     in_time, starved = tally.by_second()
-    # The last second may lack some ticks.
+    # The last second may be incomplete.
     seconds = slice(int(scenario.begun_s), int(scenario.until_s) - 1)
     ticks = in_time[seconds] + starved[seconds]
     shares = np.where(ticks > 0, in_time[seconds] / np.maximum(ticks, 1), 1.0)
@@ -267,11 +271,12 @@ def outcome(scenario: Scenario, tally: Tally, world: World, cpu_s: float) -> Out
 
 
 def limits(shape: Shape, requests_hz: float) -> list[Limit]:
-    """Return the limits by the number of robots at which they are reached, the first one first.
+    """Return the limits in the order of the number of robots at which they are reached, the
+    smallest number first.
 
     Args:
         shape: The fleet.
-        requests_hz: Requests a second of one robot.
+        requests_hz: Requests per second of one robot.
     """
     a_core = 1000 / SERVER_MS_AN_ACT
     mean_robots = shape.robots_of_a_replica
@@ -340,7 +345,7 @@ def limits(shape: Shape, requests_hz: float) -> list[Limit]:
 
 
 def _controller_cores(replicas: int) -> float:
-    """Return the CPU of Serve's controller, in cores, with autoscaling."""
+    """Return the CPU time of Serve's controller with autoscaling, in cores."""
     idle = CONTROLLER_CORES[2] + _slope(CONTROLLER_CORES) * (replicas - 2)
     return idle + DECISIONS_HZ * (DECISION_MS[400] / 400) * replicas / 1e3
 
@@ -354,7 +359,7 @@ def _controlled_replicas() -> int:
 
 
 def _slope(values: dict[int, float]) -> float:
-    """Return the growth of a value from the first to the last number of replicas, for each."""
+    """Return the growth of a value per replica, from the first to the last number of replicas."""
     first, last = min(values), max(values)
     return (values[last] - values[first]) / (last - first)
 

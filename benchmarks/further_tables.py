@@ -14,17 +14,17 @@ FILE = Path(__file__).with_name("further_tables.json")
 
 @dataclass(frozen=True, slots=True)
 class FurtherTable:
-    """A section of the page: one sentence or two, and a table."""
+    """A section of the page: one or two sentences, and a table."""
 
     title: str
     caption: str
-    command: str  # which repeats the measurement
+    command: str  # command that repeats the measurement
     date: str
     head: list[str]
     rows: list[list[str]]
 
     def to_markdown(self) -> str:
-        """Return the section, with its origin in the caption."""
+        """Return the section; the caption contains the origin of the table."""
         origin = f"(`{self.command}`, {self.date})"
         table = table_markdown(self.head, self.rows)
         return f"## {self.title}\n\n{self.caption} {origin}:\n\n{table}"

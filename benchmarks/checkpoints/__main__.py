@@ -15,14 +15,16 @@ def main(
     family: Annotated[str, typer.Argument(help="pi0, smolvla, pi05, act, diffusion or openvla.")],
     folder: Annotated[Path, typer.Argument(help="A new folder.")],
     size: Annotated[
-        Literal["full", "small"], typer.Option(help="full: as published; small: for a CPU.")
+        Literal["full", "small"],
+        typer.Option(help="full: the published size; small: a size for a CPU."),
     ] = "full",
     dtype: Annotated[
-        str | None, typer.Option(help="Of the weights; default: bfloat16, if the family has it.")
+        str | None,
+        typer.Option(help="Type of the weights; default: bfloat16, if the family supports it."),
     ] = None,
 ) -> None:
-    """Write random weights of a family's true size, and a deployment file; run it in the
-    family's environment.
+    """Write random weights of a family's true size, and a deployment file; run this in the family's
+    environment.
     """
     with errors():
         written = write_checkpoint(family, folder, size, dtype)

@@ -19,9 +19,9 @@ from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.registry import require
 from vlagents_ray_models.lerobot.checkpoint import require_served
 
-JOINTS = 6  # an SO-100
+JOINTS = 6  # number of joints of an SO-100
 _IMAGE_TOKENS = ("<image>", "<fake_token_around_image>", "<global-img>", "<end_of_utterance>")
-# SmolVLM2-500M, of which SmolVLA takes the first 16 layers
+# SmolVLM2-500M, whose first 16 layers SmolVLA uses
 # (huggingface.co/HuggingFaceTB/SmolVLM2-500M-Video-Instruct)
 SMOLVLM: Mapping[str, Any] = {
     "scale_factor": 4,
@@ -69,9 +69,10 @@ _SMALL_SMOLVLM: Mapping[str, Any] = {
 
 
 def write(recipe: Recipe) -> WrittenCheckpoint:
-    """Write the checkpoint of LeRobot's own default settings, or of a smaller network."""
+    """Write a checkpoint with LeRobot's own default settings, or of a smaller network."""
     policy, config = make_policy(recipe)
-    parameters = write_weights(policy, recipe.folder, shard_bytes=None)  # LeRobot reads one file
+    # LeRobot reads only one file of weights.
+    parameters = write_weights(policy, recipe.folder, shard_bytes=None)
     config.save_pretrained(recipe.folder)
     tokenizer = recipe.folder / "tokenizer"
     if recipe.family == "pi05":
@@ -89,7 +90,7 @@ def make_policy(recipe: Recipe) -> tuple[Any, Any]:
     ensure_torchvision()
     config = _CONFIGS[recipe.family](recipe)
     policy_class = require("lerobot.policies.factory").get_policy_class(config.type)
-    filled = recipe.family in ("act", "diffusion")  # Diffusion runs its backbone when it is made
+    filled = recipe.family in ("act", "diffusion")  # Diffusion runs its backbone on construction
     device = config.device
     with (
         contextlib.nullcontext() if filled else parameters_on_meta(),
@@ -99,8 +100,8 @@ def make_policy(recipe: Recipe) -> tuple[Any, Any]:
         policy = policy_class(config)
     config.device = device
     if recipe.family == "smolvla" and recipe.dtype == "bfloat16":
-        # as published: the language model's weights, with which LeRobot began, are bfloat16, and
-        # the rest is float32
+        # as in the published checkpoint: the language model's weights, with which LeRobot began,
+        # are bfloat16, and all others are float32
         policy.model.vlm_with_expert.vlm.to(require("torch").bfloat16)
         config.load_vlm_weights = True
     return policy, config
@@ -132,8 +133,8 @@ def features(cameras: Sequence[str], side: int, state: int = JOINTS) -> dict[str
 def make_statistics(
     state: int = JOINTS, actions: int = JOINTS, cameras: Sequence[str] = ()
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Return statistics of an invented dataset; none is the identity, and all cameras share
-    theirs.
+    """Return statistics of an invented dataset; no statistic is the identity, and all cameras have
+    the same statistics.
     """
     rng = np.random.default_rng(0)
 
@@ -155,7 +156,9 @@ def make_statistics(
 
 
 def write_processors(folder: Path, config: Any) -> None:
-    """Write the pipelines before and after a policy, with the statistics of its features."""
+    """Write the pipelines before and after a policy, with the statistics of the policy's
+    features.
+    """
     [state], [actions] = config.robot_state_feature.shape, config.action_feature.shape
     statistics = make_statistics(state, actions, list(config.image_features))
     for pipeline in require("lerobot.policies.factory").make_pre_post_processors(
@@ -166,8 +169,8 @@ def write_processors(folder: Path, config: Any) -> None:
 
 @contextlib.contextmanager
 def local_tokenizer(kind: str, folder: Path) -> Iterator[None]:
-    """Make π0's and π0.5's pipelines name a tokenizer in `folder` instead of LeRobot's, which is
-    a download.
+    """Make π0's and π0.5's pipelines name a tokenizer in `folder` instead of LeRobot's tokenizer,
+    which would be downloaded.
     """
     if not folder.is_dir():
         yield
@@ -182,7 +185,7 @@ def local_tokenizer(kind: str, folder: Path) -> Iterator[None]:
 
 
 def write_smolvlm(folder: Path, size: Mapping[str, Any]) -> Any:
-    """Write config and processor of SmolVLM to `folder`, which a SmolVLA's config names; returns
+    """Write config and processor of SmolVLM to `folder`, which SmolVLA's config names, and return
     the config.
     """
     transformers = require("transformers")

@@ -1,4 +1,4 @@
-"""Random checkpoints of OpenVLA, by the model's own code in a clone of its repository."""
+"""Random checkpoints of OpenVLA, written with the model's own code in a clone of its repository."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.openvla.prismatic import STATISTICS_FILE, find_source, model_classes
 
 ACTION_DIM, PROPRIO_DIM = 7, 8
-# Llama's 32000 and one for padding, in multiples of 64: action tokens count from its end.
+# Llama's 32000 tokens and one for padding, in multiples of 64: action tokens count from the end.
 VOCABULARY = 32064
 BINS, _MULTIPLE = 256, 64
 _PADDING = 32000
-_SIDE = 224  # px
+_SIDE = 224  # size of the images, px
 _DATASET = "bridge_orig"
 _SENTENCES = (
     "In: What action should the robot take to pick up the black bowl?\nOut:",
@@ -34,9 +34,9 @@ _SENTENCES = (
 class PrismaticSize:
     """An OpenVLA smaller than the published one."""
 
-    text: dict[str, Any]  # text of the language model's config
-    backbones: tuple[str, str]  # models of timm
-    side: int = _SIDE  # px, of their images
+    text: dict[str, Any]  # config of the language model, text part
+    backbones: tuple[str, str]  # names of vision models of timm
+    side: int = _SIDE  # size of the models' images, px
 
 
 SMALL = PrismaticSize(
@@ -71,7 +71,7 @@ def write(recipe: Recipe) -> WrittenCheckpoint:
 
 
 def make_model(recipe: Recipe, source: Path) -> tuple[Any, Any]:
-    """Return the model, on the device meta, and its image processor, by the code in `source`."""
+    """Return the model, on the device meta, and its image processor, with the code in `source`."""
     ensure_torchvision()
     size = SMALL if recipe.size == "small" else None
     model_class, processor_class = model_classes(
@@ -91,7 +91,7 @@ def make_config(config_class: Any, size: PrismaticSize | None = None, **settings
     text: dict[str, Any] = {"vocab_size": VOCABULARY, "pad_token_id": _PADDING}
     if size is not None:
         text |= size.text
-        # in the JSON these override the defaults of the backbones' id
+        # In the JSON, these values override the defaults that follow from the backbones' id.
         settings |= {"timm_model_ids": list(size.backbones), "image_sizes": [size.side, size.side]}
     return config_class(
         vision_backbone_id="dinosiglip-vit-so-224px",

@@ -13,8 +13,8 @@ from benchmarks.checkpoints.weights import parameters_on_meta, write_weights
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.registry import require
 
-STATE_DIM, ACTION_DIM = 8, 7  # LIBERO
-_IMAGE, _PATCH = 224, 14  # px
+STATE_DIM, ACTION_DIM = 8, 7  # as in LIBERO
+_IMAGE, _PATCH = 224, 14  # size of images and of patches, px
 _SPARE_TOKENS = 8
 
 
@@ -22,11 +22,11 @@ _SPARE_TOKENS = 8
 class Pi0Size:
     """A π0 smaller than the published one."""
 
-    width: int  # width of the language model and of the vision tower
+    width: int  # width of the language model and of the vision encoder
     expert_width: int
-    layers: int  # layers of the language model and of the expert
+    layers: int  # number of layers of the language model and of the action expert
     vision_layers: int
-    patch: int = _PATCH  # px
+    patch: int = _PATCH  # size of patches, px
 
 
 SMALL = Pi0Size(width=512, expert_width=256, layers=4, vision_layers=4)
@@ -38,7 +38,7 @@ def write(recipe: Recipe) -> WrittenCheckpoint:
     parameters = write_weights(model, recipe.folder)
     model.config.save_pretrained(recipe.folder)
     processor.save_pretrained(recipe.folder)
-    # one part of the state, so that its length is known
+    # The state has a single part, so its length is known.
     return WrittenCheckpoint(
         "pi0",
         parameters,
@@ -58,7 +58,9 @@ def make_model(recipe: Recipe) -> tuple[Any, Any]:
 
 
 def transformers_class(name: str) -> Any:
-    """Return a class of transformers, after making torchvision, which it imports, fit torch."""
+    """Return a class of transformers. Before the import, torchvision is made compatible with
+    torch.
+    """
     ensure_torchvision()
     return getattr(require("transformers"), name)
 

@@ -1,4 +1,4 @@
-"""The checkpoint to write, and the written one."""
+"""The descriptions of a checkpoint to be written, and of a written checkpoint."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Recipe:
     """A checkpoint to be written."""
 
     family: str
-    folder: Path  # absolute; it exists
+    folder: Path  # absolute path of an existing folder
     size: SizeName
     dtype: str  # dtype of the weights
 
@@ -23,6 +23,6 @@ class Recipe:
 class WrittenCheckpoint:
     """A checkpoint that was written."""
 
-    policy: str  # that serves it
+    policy: str  # name of the policy that serves the checkpoint
     parameters: int
     config: dict[str, Any] = field(default_factory=dict)  # the policy's settings

@@ -24,10 +24,10 @@ _LARGEST_BATCH = 32
 class Family:
     """A family of policies."""
 
-    module: str  # module of this folder
-    environment: str  # the name of its requirements: `vlagents-ray venv create NAME`
-    packages: tuple[str, ...]  # packages of that environment
-    dtypes: tuple[str, ...] = ("bfloat16", "float32")  # dtypes of the weights, the usual one first
+    module: str  # name of the module in this folder
+    environment: str  # name of the family's requirements: `vlagents-ray venv create NAME`
+    packages: tuple[str, ...]  # packages that the environment must have
+    dtypes: tuple[str, ...] = ("bfloat16", "float32")  # types of the weights, the usual type first
 
 
 FAMILIES = {
@@ -47,10 +47,10 @@ def write_checkpoint(
 
     Args:
         family: One of `FAMILIES`.
-        folder: Where the checkpoint and `deployment.yaml` are written; it must not exist, or be
+        folder: The folder for the checkpoint and `deployment.yaml`, which must not exist or be
             empty.
-        size: "full" is the published size, "small" some tens of millions of parameters.
-        dtype: Of the weights; None: the family's usual one.
+        size: "full" is the published size, "small" has some tens of millions of parameters.
+        dtype: Type of the weights; None selects the family's usual type.
 
     Returns:
         The written checkpoint.
@@ -87,7 +87,7 @@ def write_checkpoint(
         written: WrittenCheckpoint = module.write(Recipe(family, folder, size, dtype))
         _write_deployment(folder / DEPLOYMENT, family, written)
     except BaseException:
-        shutil.rmtree(folder)  # a partial checkpoint cannot be told from a complete one
+        shutil.rmtree(folder)  # a partial checkpoint looks like a complete one
         raise
     return written
 

@@ -1,4 +1,6 @@
-"""A byte-level tokenizer, trained here, since the published ones are downloads."""
+"""A byte-level tokenizer, which is trained here, since the published tokenizers would be
+downloaded.
+"""
 
 from __future__ import annotations
 
@@ -36,8 +38,8 @@ def byte_level(
 
 
 def fast_tokenizer(tokens: Any = None, **named: Any) -> Any:
-    """Return transformers' tokenizer with the special tokens `named`, or `SPECIAL`; `tokens` is
-    one of `byte_level`.
+    """Return transformers' tokenizer with the special tokens `named`, or `SPECIAL`; `tokens` is a
+    tokenizer of `byte_level`.
     """
     named = named or SPECIAL
     tokens = byte_level(list(SPECIAL.values())) if tokens is None else tokens

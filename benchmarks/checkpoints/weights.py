@@ -1,7 +1,7 @@
 """Random weights in safetensors files, written one tensor at a time.
 
 A model on the device meta has names, shapes and types, but no values. Each tensor gets its values
-when it is written, so that memory holds one tensor, not the model.
+when it is written, so that only one tensor is in memory.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _SPREAD = 0.1  # spread of scales around 1, and of biases around 0
 
 @contextmanager
 def parameters_on_meta() -> Iterator[None]:
-    """Create parameters of modules made within without values; buffers keep theirs, which a
-    checkpoint may lack.
+    """Within the context, create parameters of modules without values. Buffers keep their values,
+    which a checkpoint may lack.
     """
     module_class = require("torch").nn.Module
     parameter_class = require("torch").nn.Parameter
@@ -60,16 +60,17 @@ def write_weights(
     """Write parameters and saved buffers of a model to `folder`, in their types.
 
     Args:
-        model: The model. A tensor on the device meta gets random values; any other one keeps its
-            own.
-        folder: Gets model.safetensors, or, of a larger model, several shards and their index.
-        shard_bytes: The size of a shard, at most, unless a single tensor is larger; None:
-            everything is in one file.
+        model: The model. A tensor on the device meta gets random values; any other tensor keeps its
+            values.
+        folder: The folder for model.safetensors, or for several shards and their index if the model
+            is larger.
+        shard_bytes: The maximum size of a shard, unless a single tensor is larger; None writes
+            everything into one file.
         changes: Functions by the name of a tensor that change its values before they are written.
 
     Returns:
-        The number of parameters; one that has several names counts once, and is written under its
-        first name.
+        The number of parameters; a parameter with several names counts once, and is written under
+        its first name.
 
     Raises:
         ConfigError: The disk has too little space.
@@ -118,7 +119,8 @@ def _tensors(model: Any) -> dict[str, Any]:
     found: dict[int, tuple[str, Any]] = {}
     for name, tensor in model.state_dict(keep_vars=True).items():
         found.setdefault(id(tensor), (name, tensor))
-    # the widest types first, so that each tensor begins at a multiple of its type's size
+    # Tensors of the widest types come first, so that each tensor begins at a multiple of its type's
+    # size.
     return dict(sorted(found.values(), key=lambda one: -one[1].element_size()))
 
 

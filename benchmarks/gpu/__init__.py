@@ -1,1 +1,1 @@
-"""All that needs a GPU, measured and checked by one command: `python -m benchmarks.gpu`."""
+"""Measurements and checks that need a GPU, in one command: `python -m benchmarks.gpu`."""

@@ -1,12 +1,12 @@
-"""What only a GPU can show: `make gpu`, in two runs of at most seven minutes each. It needs neither
-Ray nor a network.
+"""Measurements and checks that need a GPU: `make gpu`, in two runs of at most seven minutes each.
+It needs neither Ray nor a network.
 
-Each step runs in a separate process within a time limit, so that a crash costs one step. The
-limits of a run fit into its time, and its plan is printed first; further steps are taken while time
-is left. After each step, the folder `--out` has what was found so far: gpu.json, gpu.md with
-tables, and gpu.log with the output of all steps. The exit status is 0 if all criteria were met.
-`--dry` runs the same steps in small sizes on a CPU, and judges no time. `python -m
-benchmarks.gpu.tables` makes the tables of the docs of the results.
+Each step runs in a separate process within a time limit, so that a crash costs one step. The time
+limits of the steps fit into the time of a run, and the plan of a run is printed first; further
+steps run while time is left. After each step, the folder `--out` has the results so far: gpu.json,
+gpu.md with tables, and gpu.log with the output of all steps. The exit status is 0 if all criteria
+were met. `--dry` runs the same steps in small sizes on a CPU, and judges no times. `python -m
+benchmarks.gpu.tables` makes the tables of the docs from the results.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from benchmarks.gpu.lab import SECONDS, Plan
 from benchmarks.gpu.runner import Runner, planned_seconds, show_plan
 from benchmarks.gpu.steps import RUNS, STEPS
 
-# Limits of a dry run, on a CPU that may be busy: its time, and the factor for its steps.
+# Limits of a dry run on a CPU that may be busy: the total time, s, and the factor for the limits of
+# steps.
 _DRY_S, _DRY_PATIENCE = 3600.0, 5.0
 
 
@@ -36,11 +37,11 @@ def main(
     ),
     steps: Annotated[str, typer.Option(help=f"Some of {', '.join(STEPS)}, instead of a run.")] = "",
     seconds: Annotated[
-        float, typer.Option(min=1, help="For all steps of a run together.")
+        float, typer.Option(min=1, help="Time for all steps of a run together.")
     ] = SECONDS,
     rows: Annotated[str, typer.Option(help="The batch sizes of the step compiled.")] = "1,8",
     dry: Annotated[bool, typer.Option("--dry", help="Small sizes, on a CPU.")] = False,
-    plan_only: Annotated[bool, typer.Option("--plan", help="Print the plan alone.")] = False,
+    plan_only: Annotated[bool, typer.Option("--plan", help="Print only the plan.")] = False,
     commit: Annotated[
         str, typer.Option(help="The commit of the code, in a copy without a git folder.")
     ] = "",
@@ -76,7 +77,7 @@ def main(
     (out / "gpu.log").unlink(missing_ok=True)
     memory = Path("/dev/shm")  # noqa: S108 - the checkpoints of 7 GB are read several times
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as scratch:
-        # So that the first start compiles all.
+        # With an empty cache, the first start compiles everything.
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = f"{scratch}/programs"
         # Imports must not initialise CUDA before a fork.
         os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")

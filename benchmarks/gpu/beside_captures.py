@@ -1,8 +1,7 @@
-"""An experiment: graphs that are replayed while others are captured.
-
-Acts wait for the captures of another checkpoint (`CaptureLock`), since a call that waits for a
-whole device ends a capture on it. An act that only replays graphs makes no such call. This step
-tries whether such acts and captures disturb each other, without the lock.
+"""An experiment with graphs that are replayed while other graphs are captured. Inference calls wait
+for the captures of another checkpoint (`CaptureLock`), since waiting for a whole device ends a
+capture on that device. An inference call that only replays graphs does not wait in this way. This
+step tests whether such calls and captures disturb each other without the lock.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.registry import require
 
-_ROWS = 512  # rows of a square matrix, whose sums are kernels of some microseconds
+_ROWS = 512  # rows of a square matrix; the kernel of a sum takes some microseconds
 _OPERATIONS = 2000  # operations of each graph, about a fifth of those of π0
 _CAPTURES = 5
 
 
 def beside_captures(lab: Lab) -> None:
-    """Replay a graph on one thread while another one captures graphs."""
+    """Replay a graph on one thread while another thread captures graphs."""
     if lab.dry:  # a CPU has no graphs
         lab.show(acts="not measured: a dry run")
         return
@@ -41,7 +40,7 @@ def replays_beside_captures(
 
     Args:
         acting_input: The tensor from which the replayed graph reads.
-        captured_input: That of the graphs that are captured.
+        captured_input: The input tensor of the captured graphs.
         operations: The number of operations of each graph.
         seconds: The time of the replays alone, s.
 
@@ -60,7 +59,7 @@ def replays_beside_captures(
     errors: list[str] = []
 
     def act() -> None:
-        """Act as a policy does whose core is a graph."""
+        """Act like a policy whose core is a graph."""
         try:
             stream.run(lambda: fetch(graph(sent)))
         except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""π0 in a child process behind the replica, as policies that need another Python have it."""
+"""π0 in a child process behind the replica, like policies that need another Python."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from vlagents_ray.serve.python_env.child_process import ChildProgram
 
 
 def child(lab: Lab) -> None:
-    """Full batches of π0 in this process and in a child process, with as many sessions as rows,
-    and with twice as many, of which half are prepared while the others are acted on.
+    """Full batches of π0 in this process and in a child process, with as many sessions as rows, and
+    with twice as many, half of which are prepared while the others are computed.
     """
     size = lab.size(8, 2)
     sizes = [1, size]

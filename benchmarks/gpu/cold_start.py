@@ -1,4 +1,4 @@
-"""The time from the start of a process to the first act of its policy: `python -m
+"""Measures the time from the start of a process to the first action of its policy: `python -m
 benchmarks.gpu.cold_start JSON`, with the settings of π0 and the number of rows.
 """
 
@@ -20,7 +20,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 def cold_start(name: str, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Start a process that loads π0 and acts once; return the seconds of each part."""
+    """Start a process that loads π0 and computes one action; return the seconds of each part."""
     command = [sys.executable, "-m", "benchmarks.gpu.cold_start", json.dumps(config)]
     begun = time.perf_counter()
     done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=False)
@@ -44,7 +44,7 @@ def cold_starts(lab: Lab) -> None:
             "batch_sizes": sizes,
         },
     }
-    if lab.dry:  # whose processes would use the compiler itself
+    if lab.dry:  # the processes would use the compiler themselves
         modes = {"eager": modes["eager"]}
     rows = []
     for name, changed in modes.items():
@@ -54,7 +54,9 @@ def cold_starts(lab: Lab) -> None:
 
 
 def _act_once(config: Mapping[str, Any]) -> dict[str, float]:
-    """Load π0, act once; return the seconds of each part, without the interpreter's own start."""
+    """Load π0 and compute one action; return the seconds of each part, without the start of the
+    interpreter.
+    """
     begun = time.perf_counter()
     from benchmarks.policy import BareAndQueued
     from vlagents_ray.policies.wrapper import build_agent

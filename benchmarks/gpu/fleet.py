@@ -1,5 +1,5 @@
-"""The fleet experiment with π0 itself, without Ray: robots in separate processes, whose ticks
-come whatever the policy does.
+"""The fleet experiment with π0 itself, without Ray: robots in separate processes, whose ticks do
+not wait for the policy.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from benchmarks.gpu.lab import Lab
 from benchmarks.policy import BareAndQueued
 from vlagents_ray.serve.fleet import CostCurve, RobotNeed, most_robots
 
-SHORT_ROWS = 8  # short rows of an answer, that robots with short chunks execute
-# Rate, whether robots execute whole chunks, and numbers of robots, as shares of those that the
-# measured batches serve by arithmetic.
+SHORT_ROWS = 8  # number of rows of an answer that robots with short chunks execute
+# Rate, whether robots execute whole chunks, and numbers of robots as shares of the number that the
+# measured batches can serve by arithmetic.
 FLEETS: Sequence[tuple[float, bool, Sequence[float]]] = (
     (10.0, False, (0.6, 0.9)),
     (5.0, False, (0.9,)),
     (10.0, True, (0.9,)),
 )
-LEAST_SHARE = 0.98  # smallest share of the ticks of a fleet that must have an action in time
+LEAST_SHARE = 0.98  # minimum share of the ticks of a fleet that must have an action in time
 
 
 def fleet(lab: Lab) -> None:
-    """Robots at 5 and 10 Hz, with short and with whole chunks: the share of their ticks that had an
-    action in time against the number of robots.
+    """Robots at 5 and 10 Hz, with short and with whole chunks: the share of ticks with an action in
+    time, by the number of robots.
     """
     sizes: Sequence[int] = lab.size((1, 4, 8, 12, 16), (1, 2))
     config = lab.settings(max_rows=sizes[-1], compile=lab.graphs, batch_sizes=list(sizes))
@@ -58,9 +58,9 @@ def fleet(lab: Lab) -> None:
 
 
 def _figures(lab: Lab, robot: Robot, count: int) -> dict[str, Any]:
-    """Run a number of equal robots, and return the figures of all together."""
+    """Run a number of equal robots, and return their combined figures."""
     plan_s = robot.chunk / robot.hz if robot.rows is None else robot.rows / robot.hz
-    # The pace of a fleet that has begun at once settles within two plans.
+    # The pace of a fleet whose robots begin at the same time settles within two plans.
     warm_s = lab.size(max(5.0, 2 * plan_s), 0.5)
     run = run_robots([robot] * count, warm_s, lab.size(8.0, 1.0))
     errors = [figures["failed"] for figures in run.figures if figures["failed"]]
@@ -80,8 +80,8 @@ def padded_costs(measured: BareAndQueued, sizes: Sequence[int], seconds: float) 
 
     Args:
         measured: The policy.
-        sizes: The sizes that are compiled, in ascending order: a batch is padded to the next one.
-        seconds: The length of the measurement of each size, s.
+        sizes: The compiled sizes in ascending order; a batch is padded to the next size.
+        seconds: The duration of the measurement of each size, s.
     """
     durations_s = [measured.bare(size, seconds)["batch_ms"] / 1e3 for size in sizes]
     table = [

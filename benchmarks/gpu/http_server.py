@@ -15,7 +15,7 @@ from vlagents_ray.serve.engine.engine import Engine
 
 @contextlib.contextmanager
 def http_server(engine: Engine) -> Iterator[str]:
-    """Yield the URL of an engine's server, whose robots use a WebSocket to the policy's thread."""
+    """Yield the URL of an engine's server; robots use a WebSocket to the policy's thread."""
     import uvicorn
 
     from vlagents_ray.serve.access.api_keys import NoKey

@@ -1,5 +1,5 @@
-"""What the steps of `benchmarks.gpu` import, once for all: their processes are forked from one that
-has imported this.
+"""The imports of the steps of `benchmarks.gpu`: the steps' processes are forked from a process that
+has imported this module.
 
 Nothing here may initialize CUDA, which does not survive a fork.
 """
@@ -11,7 +11,7 @@ from contextlib import suppress
 import benchmarks.gpu.runner
 import benchmarks.gpu.steps  # noqa: F401
 
-with suppress(ImportError):  # the steps say what is missing
+with suppress(ImportError):  # the steps report missing packages
     import torch  # noqa: F401
 
     from vlagents_ray.policies.base.accelerator import ensure_torchvision

@@ -1,4 +1,4 @@
-"""What the steps use: sizes, criteria, policies, and robots on threads."""
+"""The tools of the steps: sizes, criteria, policies, and robots on threads."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ from vlagents_ray.testing import random_observation
 
 CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist", "right_wrist_0_rgb": "right_wrist"}
 INSTRUCTION = "pick up the cube"
-SECONDS = 430.0  # seconds of a run: two fit into the quarter of an hour for which machines are lent
+# Time of a run, s. Two runs fit into a quarter of an hour, the time for which machines are lent.
+SECONDS = 430.0
 LATE_S = 120.0
-PUBLISHED = (  # by others, for comparison
+PUBLISHED = (  # figures that others have published, for comparison
     (
         "π0.5 on an H100, 3 cameras, in process: 52.4, 65.1, 91.9, 147.4 ms for 1, 2, 4, 8 rows "
         "(SGLang 0.5.23)"
@@ -47,7 +48,8 @@ PUBLISHED = (  # by others, for comparison
         "2510.26742)"
     ),
 )
-_LOOK_S, _LINES = 0.1, 25  # of `lines_of`: between two looks, and lines that are shown
+# For `lines_of`: time between two samples, s, and maximum number of lines that are shown.
+_LOOK_S, _LINES = 0.1, 25
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +57,13 @@ class Plan:
     """The settings of a run."""
 
     out: Path
-    scratch: Path  # for checkpoints, compiled programs, and what steps leave for later ones
+    # Folder for checkpoints, compiled programs, and files that steps leave for later steps.
+    scratch: Path
     dry: bool = False
-    seconds: float = SECONDS  # for all steps together
+    seconds: float = SECONDS  # time for all steps together, s
     rows: tuple[int, ...] = (1, 8)  # batch sizes that are compiled
-    commit: str = ""  # commit of the code, where the checkout itself does not state it
-    patience: float = 1.0  # factor of the limits of steps
+    commit: str = ""  # commit of the code, if the checkout does not contain it
+    patience: float = 1.0  # factor of the time limits of steps
 
     def checkpoint(self, family: str) -> dict[str, Any]:
         """Return the settings of a policy with the family's random checkpoint, which the step
@@ -72,16 +75,16 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A step, and the longest time that it may take, s."""
+    """A step, and its time limit, s."""
 
     run: Callable[[Lab], None]
     limit_s: float
-    beside: str = ""  # the step that runs at the same time, if it is run
+    beside: str = ""  # name of the step that may run at the same time
 
 
 class Lab:
-    """What a step uses and finds; each finding is written at once, as the step may not live to
-    its end.
+    """The settings and results of a step; each result is written immediately, as the step may
+    crash.
     """
 
     def __init__(self, plan: Plan, step: str) -> None:
@@ -97,8 +100,8 @@ class Lab:
 
     @contextlib.contextmanager
     def lines_of(self, thread: str | tuple[str, ...], title: str) -> Iterator[None]:
-        """Show, also while this context runs, the lines of the package in which threads spend
-        it, by their names.
+        """Show, also while the context is active, the lines of the package in which each thread
+        spends its time.
         """
         seen, over = Counter[str](), threading.Event()
 
@@ -137,7 +140,7 @@ class Lab:
 
     def check(self, name: str, got: Any, *, least: float | None = None, most: float | None = None,
               equal: Any = None, speed: bool = False) -> None:  # fmt: skip
-        """Write a criterion; one of `speed` is not judged in a dry run."""
+        """Write a criterion; a criterion of `speed` is not judged in a dry run."""
         if least is not None:
             want, passed = f"at least {least:g}", got >= least
         elif most is not None:
@@ -158,7 +161,7 @@ class Lab:
 
     @property
     def graphs(self) -> bool | str:
-        """The mode of CUDA graphs of eager cores; a CPU has none, and takes the compiler that
+        """The mode with CUDA graphs of eager cores. A CPU has no graphs, and uses the compiler that
         the runner sets.
         """
         return self.size("graphs", True)  # type: ignore[no-any-return]
@@ -170,17 +173,17 @@ class Lab:
     def measured(
         self, policy: str = "pi0", config: Mapping[str, Any] | None = None, *, largest: int
     ) -> BareAndQueued:
-        """Return a policy that is loaded as a context."""
+        """Return a policy that is loaded when its context is entered."""
         config = self.settings(max_rows=largest) if config is None else config
         return BareAndQueued(build_agent(policy, config), view, max_size=largest, patience=0.1)
 
     @contextlib.contextmanager
     def engine(self, **changed: Any) -> Iterator[Engine]:
-        """Yield an engine with π0, in CUDA graphs for one and eight rows, and a second
-        checkpoint to choose. A dry run compiles it for two rows alone.
+        """Yield an engine with π0, in CUDA graphs for one and eight rows, and with a second
+        checkpoint that sessions can select. A dry run compiles it only for two rows.
         """
         rows = self.size(8, 2)
-        # On a CPU, tracing the programs of a size takes longer than all else in a step.
+        # On a CPU, tracing the programs for a size takes longer than everything else in a step.
         batch_sizes = self.size([1, rows], [rows])
         config = self.settings(**{"compile": self.graphs, "batch_sizes": batch_sizes, **changed})
         offered = Checkpoints(partial(build_agent, "pi0"), config, {"other": {"seed": 1}}, loaded=2)
@@ -225,7 +228,8 @@ class Acting:
     """Robots that act one call after another, each on a thread, within this context."""
 
     def __init__(self, acts: Sequence[Callable[[], object]]) -> None:
-        self._calls: list[tuple[float, float, str]] = []  # end, ms, error
+        # End, duration in ms, and error of each call.
+        self._calls: list[tuple[float, float, str]] = []
         self._over = threading.Event()
         self._acting = threading.Event()  # cleared while the robots pause
         self._acting.set()
@@ -245,16 +249,16 @@ class Acting:
             thread.join(LATE_S)
 
     def pause(self) -> None:
-        """Begin no further call until `resume`."""
+        """Begin no more calls until `resume`."""
         self._acting.clear()
 
     def resume(self) -> None:
-        """Go on after `pause`."""
+        """Continue after `pause`."""
         self._acting.set()
 
     def during(self, action: Callable[[], object], least: int = 1) -> dict[str, Any]:
-        """Run an action and wait for at least so many calls; return the figures of the calls
-        that ended meanwhile.
+        """Run a function and wait for at least this number of calls; return the figures of the
+        calls that ended in that time.
         """
         begun, before = time.perf_counter(), len(self._calls)
         action()
@@ -291,7 +295,7 @@ class Acting:
 
 
 def seconds_of(lab: Lab, work: Callable[[], object], times: int = 10) -> float:
-    """Return the mean time of some work on the device, s, after one call that does not count."""
+    """Return the mean time of some work on the device, s, after a warm-up call."""
     torch = require("torch")
     wait = (lambda: None) if lab.dry else torch.cuda.synchronize
     work(), wait()

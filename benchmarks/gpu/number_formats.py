@@ -12,13 +12,13 @@ from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.policies.compilation import Quantization
 from vlagents_ray_cluster.tune.measured_policy import forget_peak, peak_mib
 
-_COUNT = 8  # episodes whose first acts are compared
-_DYNAMIC = "dynamic"  # part of the names of kinds that also compute in 8 bits, when compiled
+_COUNT = 8  # number of episodes whose first actions are compared
+_DYNAMIC = "dynamic"  # part of the names of formats that also compute in 8 bits when compiled
 
 
 def number_formats(lab: Lab) -> None:
-    """π0 in bfloat16 and in each kind of 8 bits: the time of an act, and the error of acts against
-    those in float32, which bfloat16 itself has too.
+    """π0 in bfloat16 and in each 8-bit format: the time of a call, and the error of actions
+    relative to float32; bfloat16 has such an error as well.
     """
     rows: list[dict[str, Any]] = []
     exact = _measure(lab, rows, "float32", {"dtype": "float32"}, None)
@@ -27,7 +27,8 @@ def number_formats(lab: Lab) -> None:
         lab.show(torchao="not installed")
         return
     for kind in get_args(Quantization):
-        # A kind of weights alone is captured as it is; products in 8 bits need the compiler.
+        # A format with 8-bit weights only is captured without compilation; products in 8 bits need
+        # the compiler.
         mode = lab.size(True if _DYNAMIC in kind else "graphs", False)
         try:
             _measure(lab, rows, kind, {"quantization": kind, "compile": mode}, exact)
@@ -43,10 +44,10 @@ def _measure(
     changed: dict[str, Any],
     exact: np.ndarray | None,
 ) -> np.ndarray:
-    """Load π0, add a row with its figures, and return its acts."""
+    """Load π0, add a row with its figures, and return its actions."""
     sizes = lab.size([1, 8], [1])
     if exact is None:
-        sizes = sizes[:1]  # acts of float32 are compared, and their speed is of no use
+        sizes = sizes[:1]  # only the actions in float32 are needed, not their speed
     config = {"compile": lab.size("graphs", False), "batch_sizes": sizes, "max_rows": sizes[-1]}
     forget_peak()
     settings = lab.settings(**{**config, **changed})

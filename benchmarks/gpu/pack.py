@@ -1,7 +1,6 @@
-"""All that `benchmarks.gpu` needs on a machine without a network, in one folder: `make gpu-pack`.
-
-That machine has Linux on x86-64, Python 3.12, pip, and torch with torchvision and numpy, which are
-not in the folder.
+"""Collects everything that `benchmarks.gpu` needs on a machine without a network in one folder:
+`make gpu-pack`. The machine must have Linux on x86-64, Python 3.12, pip, and torch with torchvision
+and numpy, which are not in the folder.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ from benchmarks.gpu.runner import commit
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = "3.12"
-# What `benchmarks.gpu` imports of the repository besides itself; `run.sh` installs their wheels.
+# Packages of the repository that `benchmarks.gpu` imports; `run.sh` installs their wheels.
 PLUGINS = ("cluster", "learn", "models")
 PROJECTS = [str(ROOT), *(str(ROOT / f"plugins/vlagents_ray_{name}") for name in PLUGINS)]
-# Beside the repository's own files, such a folder still fits into an upload of 64 MiB.
+# With the repository's own files, a folder of this size still fits into an upload of 64 MiB.
 MOST_MIB = 55.0
 PACKAGES = (
     "transformers==5.23.*",
@@ -38,7 +37,8 @@ PACKAGES = (
     "pytest-timeout",
     "hypothesis",
 )
-THERE = ("numpy", "torch", "hf_xet")  # with torch; hf_xet only serves downloads
+# Packages that come with torch, and hf_xet, which only serves downloads.
+THERE = ("numpy", "torch", "hf_xet")
 PLATFORMS = (
     "manylinux_2_28",
     "manylinux_2_27",
@@ -77,7 +77,7 @@ def main(
         "build/gpu-pack"
     ),
 ) -> None:
-    """Collect the files of the repository, wheels, and run.sh."""
+    """Collect the files of the repository, the wheels, and run.sh."""
     out = out.absolute()
     shutil.rmtree(out, ignore_errors=True)
     wheels = out / "wheels"

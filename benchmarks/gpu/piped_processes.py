@@ -14,11 +14,12 @@ from benchmarks.gpu.lab import LATE_S
 def piped_processes(
     run: Callable[..., None], arguments: Sequence[tuple[Any, ...]]
 ) -> Iterator[list[Any]]:
-    """Run processes within a context, and yield the pipes to them, once each has sent that it is
-    ready.
+    """Run processes within a context, and yield the pipes to them once each process has reported
+    that it is ready.
 
     Args:
-        run: What a process runs, given its end of the pipe and further arguments.
+        run: The function of a process, which is called with its end of the pipe and the further
+            arguments.
         arguments: The further arguments of each process.
     """
     context = multiprocessing.get_context("spawn")

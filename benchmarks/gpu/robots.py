@@ -1,4 +1,6 @@
-"""Robots in separate processes, that send photographs and act again at each answer."""
+"""Robots in separate processes that send photographs, each as soon as the last answer has
+arrived.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from vlagents_ray.serve.python_env.child_start import die_with_parent
 
 
 def served(lab: Lab) -> None:
-    """Robots in a process each, with three cameras as JPEG, over a WebSocket."""
+    """Measure robots, each in a separate process, with three cameras as JPEG over a WebSocket."""
     counts = lab.size([1, 4, 8], [1, 2])
     config = lab.settings(max_rows=counts[-1], compile=lab.graphs, batch_sizes=counts)
     with lab.measured(config=config, largest=counts[-1]) as measured:
@@ -53,8 +55,8 @@ def robots(url: str, contract: Contract | None, count: int) -> Iterator[list[Any
 
 
 def act_together(pipes: Sequence[Any], seconds: float) -> dict[str, Any]:
-    """Let robots act at the same time; return the figures of all, of which the times are those of
-    the slowest robot.
+    """Let robots act at the same time; return their combined figures, with the times of the slowest
+    robot.
     """
     for pipe in pipes:
         pipe.send(seconds)

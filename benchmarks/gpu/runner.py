@@ -29,10 +29,10 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.python_env.child_start import die_with_parent
 
 _ROOT = Path(__file__).resolve().parents[2]
-_SPARE_S = 15.0  # without which no step is started
+_SPARE_S = 15.0  # minimum remaining time, s, with which a step is started
 _STACKS_S = (
-    # Before the limit of a step, when the log gets the stacks of all its threads, at which Python
-    # may crash.
+    # Time before the limit of a step, s, at which the stacks of all its threads are logged; Python
+    # may crash while it does this.
     1.0
 )
 
@@ -50,7 +50,7 @@ def _child(plan: Plan, name: str, run: Callable[[Lab], None], limit_s: float) ->
         if plan.dry:
             Compilation.backend = "eager"
             pi0.SMALL = pi0.Pi0Size(width=64, expert_width=32, layers=2, vision_layers=1, patch=56)
-            # For so small a model, threads only wait for one another.
+            # With a model of this size, more threads would only wait for each other.
             require("torch").set_num_threads(1)
         run_sampled(lab, run)
     except BaseException as error:  # noqa: BLE001 - a step may raise any error, which is its result
@@ -61,21 +61,23 @@ def _child(plan: Plan, name: str, run: Callable[[Lab], None], limit_s: float) ->
             equal="its end",
         )
         sys.stdout.flush()
-        os._exit(1)  # without waiting for the threads of a broken step
+        os._exit(1)  # ends without waiting for the threads of a broken step
 
 
 def run_sampled(lab: Lab, run: Callable[[Lab], None]) -> None:
-    """Run a step, and show the power and the clock of the GPU meanwhile."""
+    """Run a step, and show the power and the clock of the GPU during the step."""
     with GpuSamples() as samples:
         run(lab)
     lab.show(**samples.summary())
 
 
 class Runner:
-    """Runs the steps, and writes what was found after each."""
+    """Runs the steps, and writes the results after each step."""
 
     def __init__(self, plan: Plan, steps: Mapping[str, Step], extras: Sequence[str] = ()) -> None:
-        """Prepare the run of all `steps`; `extras` are those that a lack of time may leave out."""
+        """Prepare the run of all `steps`; `extras` are steps that may be left out for lack of
+        time.
+        """
         self._plan, self._steps, self._results = plan, steps, dict[str, Any]()
         self._extras = extras
         self._context: Any = multiprocessing.get_context("forkserver")
@@ -135,7 +137,7 @@ class Runner:
         if process.pid is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-        process.kill()  # also if it has no group yet
+        process.kill()  # the process may not have a group yet
         process.join()
         file = self._plan.scratch / f"step-{name}.json"
         found = json.loads(file.read_text()) if file.is_file() else {"figures": {}, "checks": []}
@@ -167,7 +169,9 @@ class Runner:
 
 
 def planned_seconds(steps: Sequence[Step]) -> float:
-    """Return the longest time that steps can take, s; one beside another takes none of its own."""
+    """Return the maximum total time of steps, s; a step that runs beside another step adds no
+    time.
+    """
     return sum(step.limit_s for step in steps if not step.beside)
 
 
@@ -184,8 +188,8 @@ def show_plan(steps: Mapping[str, Step], extras: Sequence[str], seconds: float) 
 
 
 def commit() -> str:
-    """Return the commit of this checkout, or of the one that was packed, and whether files have
-    changed since; empty if none is known.
+    """Return the commit of this checkout, or of the packed checkout, and whether files have changed
+    since; empty if the commit is unknown.
     """
     packed = _ROOT / "COMMIT"
     if packed.is_file():

@@ -1,4 +1,4 @@
-"""The power, clock and temperature of a GPU while something runs, by samples of nvidia-smi."""
+"""Samples the power, clock and temperature of a GPU with nvidia-smi."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 
 from typing_extensions import Self
 
-NO_GPU = "no GPU"  # in place of the name of a card
+NO_GPU = "no GPU"  # replaces the name of a card
 _PERIOD_MS = 100
 _FIELDS = ("power.draw", "clocks.sm", "temperature.gpu", "clocks_event_reasons.active")
-# Bits of the reasons for which a GPU is slower than it could be, other than a lack of work:
+# Bits of the reasons for which the clock of a GPU is limited, other than idleness:
 # https://docs.nvidia.com/deploy/nvml-api/group__nvmlClocksEventReasons.html
 _LIMITS = {
     0x4: "power cap",
@@ -44,12 +44,15 @@ def card() -> str:
 
 @dataclass
 class GpuSamples:
-    """Samples of the first GPU within this context; none on a machine without nvidia-smi."""
+    """Samples of the first GPU within this context; there are none on a machine without
+    nvidia-smi.
+    """
 
     watts: list[float] = field(default_factory=list)
     clocks_mhz: list[float] = field(default_factory=list)
     celsius: list[float] = field(default_factory=list)
-    limits: set[str] = field(default_factory=set)  # reasons for which the clock was limited
+    # Names of the reasons for which the clock was limited.
+    limits: set[str] = field(default_factory=set)
 
     def __enter__(self) -> Self:
         program = shutil.which("nvidia-smi")
@@ -58,7 +61,7 @@ class GpuSamples:
             return self
         query = f"--query-gpu={','.join(_FIELDS)}"
         command = [program, "-i", "0", query, "--format=csv,noheader,nounits"]
-        # Otherwise a program writes to a pipe in blocks.
+        # Without this, a program writes to a pipe in blocks.
         by_line = ["stdbuf", "-oL"] if shutil.which("stdbuf") else []
         self._process = subprocess.Popen(
             [*by_line, *command, "-lms", str(_PERIOD_MS)], stdout=subprocess.PIPE, text=True
@@ -80,7 +83,7 @@ class GpuSamples:
                     self.add(line)
 
     def forget(self) -> None:
-        """Drop the samples so far, which may be of the time before a load."""
+        """Drop the samples so far, which may be from before the load."""
         for samples in (self.watts, self.clocks_mhz, self.celsius, self.limits):
             samples.clear()
 
@@ -99,10 +102,11 @@ class GpuSamples:
             self.limits.update(name for bit, name in _LIMITS.items() if reasons & bit)
 
     def figures(self, acts_per_s: float) -> dict[str, Any]:
-        """Return those of `summary`, and the energy of an act; nothing without samples.
+        """Return the figures of `summary`, and the energy of an action; return nothing without
+        samples.
 
         Args:
-            acts_per_s: Acts a second while the samples were taken.
+            acts_per_s: Actions per second while the samples were taken.
         """
         summary = self.summary()
         if not summary:
@@ -110,8 +114,8 @@ class GpuSamples:
         return {**summary, "joules_an_act": summary["watts"] / max(acts_per_s, 1e-9)}
 
     def summary(self) -> dict[str, Any]:
-        """Return the mean power, the median clock, the highest temperature, and what limited the
-        clock; nothing without samples.
+        """Return the mean power, the median clock, the highest temperature, and the reasons that
+        limited the clock; return nothing without samples.
         """
         if not (self.watts and self.clocks_mhz and self.celsius):
             return {}

@@ -1,5 +1,5 @@
-"""Two replicas on one GPU, each with half of its memory: their kernels take turns, or run at once
-with NVIDIA's Multi-Process Service (MPS).
+"""Two replicas on one GPU, each with half of its memory: their kernels alternate, or run at the
+same time with NVIDIA's Multi-Process Service (MPS).
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.python_env.child_start import die_with_parent
 
 SHARE = 0.5
-_OVER = 0.6  # share of the memory: more than a replica with half of it may allocate
+_OVER = 0.6  # share of the memory that a replica with half of it must not be able to allocate
 _MPS = "nvidia-cuda-mps-control"
 _PIPES, _LOGS = "CUDA_MPS_PIPE_DIRECTORY", "CUDA_MPS_LOG_DIRECTORY"
 
 
 def sharing(lab: Lab) -> None:
-    """Actions a second of one replica, of two, and of two with MPS; and their limit of memory."""
+    """Measure the actions per second of one replica, of two, and of two with MPS; and check their
+    memory limit.
+    """
     rows: list[dict[str, Any]] = []
     with _replicas(lab, 1) as replicas:
         rows.append({"replicas": "1", **_together(lab, replicas)})
@@ -43,7 +45,7 @@ def sharing(lab: Lab) -> None:
         with _mps(control) as variables, _replicas(lab, 2, variables) as replicas:
             rows.append({"replicas": "2, MPS", **_together(lab, replicas)})
     except (subprocess.CalledProcessError, EOFError) as error:
-        # The service, or a client of it, ended: a container may not permit it.
+        # The service, or one of its clients, ended, as a container may not permit MPS.
         lab.show(mps=f"failed: {type(error).__name__} {error}")
         return
     lab.show(shared=rows)
@@ -53,7 +55,9 @@ def sharing(lab: Lab) -> None:
 
 @contextlib.contextmanager
 def _mps(control: str) -> Iterator[dict[str, str]]:
-    """Run the service of this user within a context, and yield the variables of its clients."""
+    """Run the MPS of this user within a context, and yield the environment variables of its
+    clients.
+    """
     with tempfile.TemporaryDirectory() as folder:
         variables = {_PIPES: f"{folder}/pipe", _LOGS: f"{folder}/log"}
         for path in variables.values():
@@ -97,7 +101,7 @@ def _together(lab: Lab, pipes: Sequence[Any]) -> dict[str, float]:
 
 
 def _serve(pipe: Any, config: dict[str, Any], size: int, environment: Mapping[str, str]) -> None:
-    """Load π0, and answer questions until the pipe is closed; a separate process."""
+    """Load π0, and answer requests until the pipe is closed; runs in a separate process."""
     die_with_parent()
     os.environ |= environment
     from benchmarks.policy import BareAndQueued

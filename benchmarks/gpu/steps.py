@@ -1,4 +1,4 @@
-"""The steps. Each runs in a separate process, and finds figures and criteria in a `Lab`."""
+"""The steps. Each runs in a separate process, and writes figures and criteria to a `Lab`."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ ROOT = Path(__file__).resolve().parents[2]
 GPU_TESTS = (
     "tests/policies/compilation/test_cuda_graph.py",
     "plugins/vlagents_ray_learn/tests/test_one_gpu.py",
-)  # they need no Ray
-# Least rate of matrix products in bfloat16. About 800 were measured; if it is lower, something else
-# is wrong.
+)  # tests that need no Ray
+# Minimum rate of matrix products in bfloat16. About 800 were measured; a lower rate shows another
+# problem.
 _H100_TFLOPS = 600
 GRAPH_ROWS = (1, 2, 4, 8, 16, 32)  # batch sizes with CUDA graphs
-WORDS = 200  # tokens of an instruction of π0.5
-_MOST_PLACES = 8  # rows of the batches that are looked into
-PUSHES = 20  # pushes of a learner that makes new tensors for each
+WORDS = 200  # number of tokens in an instruction of π0.5
+_MOST_PLACES = 8  # number of rows in the batches that are examined
+PUSHES = 20  # number of pushes of a learner that allocates new tensors for each push
 
 
 def facts(lab: Lab) -> None:
@@ -111,7 +111,7 @@ def facts(lab: Lab) -> None:
 
 
 def gpu_tests(lab: Lab) -> None:
-    """The tests that need a GPU, but no Ray."""
+    """Run the tests that need a GPU but no Ray."""
     words = ["--collect-only"] if lab.dry else ["--tb=short"]
     done = subprocess.run(
         [
@@ -140,7 +140,7 @@ def gpu_tests(lab: Lab) -> None:
 
 
 def checkpoint(lab: Lab) -> None:
-    """Random π0 of its true size, and π0.5 where LeRobot is installed."""
+    """Write random checkpoints of π0, and of π0.5 if LeRobot is installed, in their true sizes."""
     for family in ("pi0", "pi05"):
         begun, folder = time.perf_counter(), lab.plan.scratch / family
         try:
@@ -187,8 +187,8 @@ def curve(lab: Lab, measured: BareAndQueued, sizes: Sequence[int]) -> list[dict[
 def one_act(
     lab: Lab, measured: BareAndQueued, sizes: Sequence[int], rows: Sequence[Mapping[str, Any]]
 ) -> None:
-    """Look into one act of each size: launches, the time in which the GPU works, its gaps, waits
-    for it, and the longest kernels of each core.
+    """Profile one call of each batch size: launches, the busy time and the gaps of the GPU, waits
+    for the GPU, and the longest kernels of each core.
     """
     looked = []
     for size in sizes:
@@ -204,14 +204,12 @@ def one_act(
 
 
 def neighbours(lab: Lab, measured: BareAndQueued, size: int) -> float:
-    """Compare acts of one episode: at each place of a full batch with other neighbours there, and
-    with the one alone.
-
-    In one place, equal kernels compute a row, so that its neighbours change no bit; alone, other
-    ones round elsewhere.
+    """Compare the actions of one episode: at each place of a full batch with different neighbours,
+    and in a batch of its own. At one place the same kernels compute a row, so its neighbours change
+    no bit; alone, other kernels round differently.
 
     Returns:
-        The largest error of an act in a batch, relative to the one alone.
+        The largest error of an action in a batch, relative to the action that is computed alone.
     """
     alone, changed, errors = measured.batch([0])()[0].action, 0, []
     for place in range(size):
@@ -227,8 +225,8 @@ def neighbours(lab: Lab, measured: BareAndQueued, size: int) -> float:
 
 
 def speed(lab: Lab, mode: bool | str) -> None:
-    """Load π0, eager or compiled; measure it by batch size, and compare its acts with the eager
-    ones.
+    """Load π0, eager or compiled; measure it by batch size, and compare its actions with eager
+    actions.
     """
     rows_of_mode = {False: (1, 8), True: lab.plan.rows, "graphs": GRAPH_ROWS}
     sizes = lab.size([*rows_of_mode[mode]], [1, 2])
@@ -273,7 +271,7 @@ def speed(lab: Lab, mode: bool | str) -> None:
         )
     )
     errors = [row_error(found, eager[name]) for name, found in acts.items() if name in eager]
-    # Or what another batch size changes.
+    # The difference, or the difference that another batch size makes.
     limit = max(TOLERANCE["bfloat16"], float(eager["rounded"]))
     lab.check("error of compiled acts of other inputs", max(errors), most=limit)
     lab.check(
@@ -285,7 +283,7 @@ def speed(lab: Lab, mode: bool | str) -> None:
 
 
 def words(lab: Lab) -> None:
-    """π0 with 200 words, which has as many tokens as π0.5."""
+    """Measure π0 with 200 words, which are as many tokens as in π0.5."""
     sizes = lab.size([1, 2, 4, 8], [1, 2])
     config = lab.settings(
         max_tokens=WORDS, max_rows=sizes[-1], compile=lab.graphs, batch_sizes=sizes
@@ -299,7 +297,7 @@ def words(lab: Lab) -> None:
 
 
 def again(lab: Lab) -> None:
-    """Start a process with the compiled π0, whose programs are kept."""
+    """Start a process with the compiled π0, whose compiled programs are stored."""
     sizes = lab.size([*lab.plan.rows], [1, 2])
     if lab.dry:  # another process would use the compiler itself
         lab.show(starts="not measured: a dry run")
@@ -311,7 +309,7 @@ def again(lab: Lab) -> None:
 
 
 def loading(lab: Lab) -> None:
-    """Load a second checkpoint beside acting sessions."""
+    """Load a second checkpoint while sessions act."""
     with lab.engine() as engine:
         robots = [Session(engine, seed) for seed in range(lab.size(8, 2))]
         with Acting([robot.ask for robot in robots]) as acting:
@@ -349,7 +347,7 @@ def pushes(lab: Lab) -> None:
             fixed.ask("reset", instruction=INSTRUCTION, kwargs={"seed": 50, "weights": "follow"})
             return np.asarray(fixed.ask().act.action)  # type: ignore[union-attr]
 
-        threads = ("asyncio_", "MainThread")  # on which values are staged
+        threads = ("asyncio_", "MainThread")  # names of the threads on which values are staged
 
         def pushed(way: str, push: Callable[[], object]) -> None:
             forget_peak()
@@ -359,7 +357,7 @@ def pushes(lab: Lab) -> None:
             ):
                 found = acting.during(push, 2 * len(robots))
             reserved = {} if lab.dry else {"reserved_mib": torch.cuda.memory_reserved() / 2**20}
-            # Both alone, as batches of other sizes round differently.
+            # Both are computed alone, as batches of other sizes round differently.
             changed = not np.array_equal(act(), before)
             rows.append(
                 {"from": way, **found, "peak_mib": peak_mib(), **reserved, "changed": changed}
@@ -393,13 +391,15 @@ def pushes(lab: Lab) -> None:
         lab.check(
             "seconds of a push from another process", rows[3]["seconds"], most=0.3, speed=True
         )
-        # Without this step's copy of the first ones.
+        # Without this step's copy of the first weights.
         held = max(row["peak_mib"] for row in rows) - model_mib
         lab.check("peak memory, times the model", held / model_mib, most=3.2, speed=True)
 
 
 def take_push(lab: Lab, engine: Engine, values: Any, version: int) -> None:
-    """Take values that another process shares as the weights of all sessions that follow."""
+    """Use values that another process shares as the weights of all sessions that follow the newest
+    weights.
+    """
     options = PushOptions("keep", allow_same=True)
     engine.weights.stage(version, values.others if lab.dry else values, options)
     engine.weights.commit(version, options)
@@ -408,12 +408,12 @@ def take_push(lab: Lab, engine: Engine, values: Any, version: int) -> None:
 def temporary_pushes(
     lab: Lab, like: Mapping[str, Any], take: Callable[[Any, int], None]
 ) -> dict[str, float]:
-    """Take pushes of a learner in another process that makes new tensors for each of them, as
-    gathered shards or merged adapters are.
+    """Apply pushes of a learner in another process that allocates new tensors for each push, as
+    with gathered shards or merged adapters.
 
     Returns:
-        The median time of a push, s, and the memory of the learner after the first one and after
-        all, MiB.
+        The median time of a push, s, and the memory of the learner after the first push and after
+        all pushes, MiB.
     """
     count = lab.size(PUSHES, 2)
     context = multiprocessing.get_context("spawn")
@@ -449,14 +449,14 @@ def _learn_again(pipe: Any, shapes: Mapping[str, Any], device: str, count: int) 
         values = _filled(shapes, 0.01 + 0.001 * number, device)
         with shared(values) as found:
             pipe.send(found)
-            pipe.recv()  # when the policy has copied them
+            pipe.recv()  # arrives when the policy has copied the values
         del values, found
         reserved = torch.cuda.memory_allocated() if torch.cuda.is_initialized() else 0
         pipe.send(reserved / 2**20)
 
 
 def _shapes_of(values: Mapping[str, Any]) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return shapes and names of types."""
+    """Return the shapes of tensors and the names of their types."""
     return {
         name: (tuple(value.shape), str(value.dtype).removeprefix("torch."))
         for name, value in values.items()
@@ -473,10 +473,9 @@ def _filled(shapes: Mapping[str, Any], number: float, device: str) -> dict[str, 
 
 
 def sleep(lab: Lab) -> None:
-    """Free the policy's memory for a learner, and restore it: times, and memory of the process.
-
-    At last a learner in another process uses the memory meanwhile, and pushes its values when the
-    policy has woken, as in a turn of reinforcement learning.
+    """Free the policy's memory for a learner, and restore it; measure the times, and the memory of
+    the process. Finally a learner in another process uses the memory in between, and pushes its
+    values when the policy has woken, as in an iteration of reinforcement learning.
     """
     torch = require("torch")
 
@@ -563,12 +562,12 @@ def _learn(pipe: Any, shapes: Mapping[str, Any], device: str) -> None:
     values = _filled(shapes, 0.01, device)
     with shared(values) as found:
         pipe.send(found)
-        pipe.recv()  # when the policy has copied them
+        pipe.recv()  # arrives when the policy has copied the values
 
 
 def learning(lab: Lab) -> None:
-    """Samples, plans that continue, and log-probabilities in bfloat16 against those that a
-    float32 learner computes.
+    """Compare samples, continued plans and log-probabilities in bfloat16 with those that a float32
+    learner computes.
     """
     from vlagents_ray.policies.flow import logprob_of_chain
     from vlagents_ray_models.pi0 import flow_velocity
@@ -589,7 +588,7 @@ def learning(lab: Lab) -> None:
         act = agent.act(replace(obs, info=info))
         return act, (time.perf_counter() - begun) * 1e3
 
-    timed(server)  # the first one also loads kernels
+    timed(server)  # the first call also loads kernels
     plain, plain_ms = timed(server)
     sampled, sampled_ms = timed(server, **{SAMPLES: count})
     lab.show(act_ms=plain_ms, samples=count, samples_ms=sampled_ms)
@@ -617,7 +616,7 @@ def learning(lab: Lab) -> None:
 
 
 def numerics(lab: Lab) -> None:
-    """TF32, and numbers of 8 bits."""
+    """Measure TF32, and 8-bit formats."""
     torch, side = require("torch"), lab.size(4096, 64)
     a = torch.randn(side, side, device=lab.device)
     rows = []
@@ -637,7 +636,7 @@ def numerics(lab: Lab) -> None:
 
 
 def jax_beside(lab: Lab) -> None:
-    """JAX beside torch in one process: the memory that it takes."""
+    """Measure the memory that JAX takes beside torch in one process."""
     torch = require("torch")
     if importlib.util.find_spec("jax") is None:
         lab.show(jax="not installed")
@@ -657,7 +656,7 @@ def jax_beside(lab: Lab) -> None:
 
 
 def families(lab: Lab) -> None:
-    """Other families whose packages are installed, with random weights."""
+    """Run other families whose packages are installed, with random weights."""
     rows = []
     for family in FAMILIES:
         if family in ("pi0", *lab.size([], ["openvla", "pi05"])):
@@ -681,8 +680,8 @@ def families(lab: Lab) -> None:
 
 
 def destruction(lab: Lab) -> None:
-    """Exhaust the memory, then fail the GPU: one row still acts, and the health check reports
-    the failure.
+    """Exhaust the memory, then make the GPU fail: a single row can still be computed, and the
+    health check reports the failure.
     """
     torch, largest = require("torch"), lab.size(16, 2)
     with lab.engine(compile=False, batch_sizes=None, max_rows=largest) as engine:
@@ -693,7 +692,8 @@ def destruction(lab: Lab) -> None:
         def full(rows: Sequence[Any]) -> Any:
             if lab.dry and len(rows) > 1:
                 raise torch.OutOfMemoryError("CUDA out of memory")
-            if not lab.dry:  # 512 MiB are left: one row fits, and the layers of sixteen do not
+            # 512 MiB remain: enough for one row, but not for the layers of sixteen rows.
+            if not lab.dry:
                 torch.cuda.empty_cache()
                 free = max(0, torch.cuda.mem_get_info()[0] - 2**29)
                 hogs.append(torch.empty(free, dtype=torch.uint8, device=lab.device))
@@ -732,7 +732,7 @@ def destruction(lab: Lab) -> None:
             os._exit(0)  # nothing can be freed on a failed GPU
 
 
-# All steps, with the longest time that each may take, s.
+# All steps, with their time limits, s.
 STEPS = {
     "facts": Step(facts, 20),
     "checkpoint": Step(checkpoint, 70, beside="tests"),
@@ -761,7 +761,7 @@ STEPS = {
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run of steps, whose limits fit into `SECONDS`, and of steps for which time may be left."""
+    """A run of steps whose limits fit into `SECONDS`, and of further steps if time is left."""
 
     steps: tuple[str, ...]
     extras: tuple[str, ...]

@@ -25,7 +25,7 @@ BEGIN, END = "<!-- gpu -->", "<!-- /gpu -->"
 _ORIGIN = ("date", "commit", "command", "gpu", "versions")
 _SHOWN_VERSIONS = ("torch", "transformers", "torchao")
 _LEAST_DATE = "0000-00-00"
-_KERNELS = 10  # kernels of each core that the page shows; `latest.json` has 25
+_KERNELS = 10  # maximum number of kernels of each core that the page shows; `latest.json` has 25
 
 _CURVE = {
     "rows": "rows",
@@ -47,10 +47,10 @@ _ACTS = {
 
 @dataclass(frozen=True, slots=True)
 class TableOf:
-    """A table of the page: a figure of a step."""
+    """A table of the page, which shows a figure of a step."""
 
     step: str
-    figure: str  # a list of rows
+    figure: str  # name of a figure that is a list of rows
     title: str
     columns: Mapping[str, str]  # headings by the keys of the rows
 
@@ -169,7 +169,7 @@ TABLES = (
 
 
 def merged(latest: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the latest steps, with those of a report in the place of older ones.
+    """Return the latest steps, after replacing older steps with those of a report.
 
     Args:
         latest: Steps by name, each with its "origin".
@@ -215,7 +215,9 @@ def to_markdown(steps: Mapping[str, Any]) -> str:
 
 
 def _caption(title: str, step: Mapping[str, Any], newest: Mapping[str, Any]) -> str:
-    """Return the line above a table: what it has, and where, when and with what it was measured."""
+    """Return the caption of a table: its content, and the card, date and commit of the
+    measurement.
+    """
     origin, figures = step["origin"], step["figures"]
     facts = [origin["gpu"]]
     if "clock_mhz" in figures:
@@ -235,7 +237,7 @@ def _caption(title: str, step: Mapping[str, Any], newest: Mapping[str, Any]) -> 
 
 
 def _table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
-    """Return a table of the columns that some row has."""
+    """Return a table with each column that at least one row has."""
     filled: set[str] = set().union(*rows)
     present = [key for key in columns if key in filled]
     lines = [[columns[key] for key in present], ["---"] * len(present)]
@@ -281,7 +283,8 @@ def write_page(page: Path, steps: Mapping[str, Any]) -> None:
 
 def main(
     reports: Annotated[
-        list[Path], typer.Argument(help="gpu.json of runs; none: the page alone.")
+        list[Path],
+        typer.Argument(help="gpu.json files of runs; without any, only the page is written."),
     ] = [],  # noqa: B006
     latest: Annotated[Path, typer.Option(help="The figures of all steps.")] = LATEST,
     page: Annotated[Path, typer.Option(help="The page with the tables.")] = PAGE,

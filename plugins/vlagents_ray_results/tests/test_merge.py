@@ -152,7 +152,10 @@ def test_a_lost_episode_gives_way_to_one_that_was_played(
 @pytest.mark.parametrize(
     ("said", "told"),
     [
-        (lambda name: {"checkpoint": name}, r"policy 'policy' has checkpoint 'y'.*before it 'x'"),
+        (
+            lambda name: {"checkpoint": name},
+            r"policy 'policy' has checkpoint 'y'.*before it have 'x'",
+        ),
         (
             lambda name: {"checkpoint": "a", "weights": {"digest": name, "revision": None}},
             r"policy policy: weights was x, is y",
@@ -389,7 +392,7 @@ def test_other_weights_under_the_same_name_are_not_merged(
     for other in (b, elsewhere):
         with pytest.raises(
             ConfigError,
-            match=r"was run by several weights under one name: .*'x'.*'y'.*merge those",
+            match=r"was run by several weights under one name: .*'x'.*'y'.*merge these",
         ):
             merge(tmp_path / "out", [a, other])
     with_weights(b, "x")
