@@ -24,7 +24,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from functools import cache, partial
 from http.client import HTTPConnection
 from pathlib import Path
@@ -48,6 +48,7 @@ from websockets.extensions.permessage_deflate import ClientPerMessageDeflateFact
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
+from benchmarks.processes import cpu_seconds
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.shm import ShmTransport
@@ -1046,17 +1047,89 @@ def attack(endpoint: str, part: str, where: Where, connections: int, seconds: fl
                     send(message, where, key_of(endpoint), end)
             time.sleep(0.001)
 
-    if endpoint in HTTP and endpoint != OWN_HTTP:
-        # An attacker has a machine of its own. Its threads would take the turns of HAProxy, the
-        # server and the robot, through all of which a request goes: p50 3 -> 15 ms on two cores,
-        # of which this leaves 4.7 -> 5.1 ms, while the flood takes as much of the cores as before.
+    if is_at_idle_priority(endpoint):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    threads = [threading.Thread(target=flood, daemon=True) for _ in range(connections)]
+    run_in_threads(flood, connections, seconds)
+
+
+def is_at_idle_priority(endpoint: str) -> bool:
+    """Return whether the flood of an endpoint only runs when nothing else does.
+
+    An attacker has a machine of its own. Its threads would take the turns of HAProxy, the server
+    and the robot, through all of which a request goes: p50 3 -> 15 ms on two cores, of which this
+    leaves 4.7 -> 5.1 ms, while the flood takes as much of the cores as before.
+    """
+    return endpoint in HTTP and endpoint != OWN_HTTP
+
+
+def run_in_threads(target: Callable[[], None], number: int, seconds: float) -> None:
+    """Run a function on so many threads, for at most so long; print when they have begun."""
+    end = time.monotonic() + seconds
+    threads = [threading.Thread(target=target, daemon=True) for _ in range(number)]
     for thread in threads:
         thread.start()
-    print("begun", flush=True)
+    print(f"begun {os.getpid()}", flush=True)
     for thread in threads:
         thread.join(max(0.0, end - time.monotonic()))
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a process has used so far."""
+
+    at: float  # on the clock `time.monotonic`, s
+    cpu_s: float
+    waits: int  # how often its threads have waited
+
+    @classmethod
+    def by(cls, pid: int) -> Usage:
+        """Return the usage of a process."""
+        waits = 0
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for line in (task / "status").read_text().splitlines():
+                if line.startswith("voluntary_ctxt_switches"):
+                    waits += int(line.split()[1])
+        return cls(time.monotonic(), cpu_seconds(pid), waits)
+
+
+@dataclass(frozen=True)
+class Load:
+    """The CPU time that a flood takes from the cores by itself, which an attacker on another
+    machine does not.
+    """
+
+    threads: int
+    cores: float  # CPU seconds a second, of all threads
+    waits_per_s: float  # of all threads
+    at_idle_priority: bool
+
+    def burn(self, seconds: float) -> None:
+        """Take the same CPU time, without a connection to anything."""
+        if self.at_idle_priority:
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        share = min(1.0, self.cores / self.threads)
+        period_s = min(1.0, self.threads / max(self.waits_per_s, 1.0))
+        hashed = bytes(2**20)
+        begun = time.thread_time()
+        hashlib.sha256(hashed)
+        bytes_per_s = len(hashed) / (time.thread_time() - begun)
+        end = time.monotonic() + seconds
+
+        def take_turns() -> None:
+            due_s = 0.0  # CPU time that this thread is to take, less what it has taken
+            while time.monotonic() < end:
+                due_s += share * period_s
+                turn = time.thread_time()
+                # Without the GIL, as system calls are.
+                size = int(due_s * bytes_per_s)
+                while size > 0:
+                    hashlib.sha256(memoryview(hashed)[:size])
+                    size -= len(hashed)
+                used_s = time.thread_time() - turn
+                due_s -= used_s
+                time.sleep(max(1e-6, period_s * (1 - share)))
+
+        run_in_threads(take_turns, self.threads, seconds)
 
 
 @contextlib.contextmanager
@@ -1086,20 +1159,71 @@ def child(*args: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def serve_attacks() -> None:
-    """Fork a process for each attack that the standard input names, and kill it at the next line.
+    """Fork a process for each attack or load that the standard input names, and kill it at the
+    next line.
 
     A separate process for each would import for most of a second.
     """
     for line in iter(sys.stdin.readline, ""):
-        arguments = json.loads(line)
+        kind, arguments, seconds = json.loads(line)
         attacker = os.fork()
         if attacker == 0:
-            attack(*arguments)
+            if kind == "load":
+                Load(*arguments).burn(seconds)
+            else:
+                attack(*arguments, seconds)
             os._exit(0)
         sys.stdin.readline()
         os.kill(attacker, signal.SIGKILL)
         os.waitpid(attacker, 0)
         print("ended", flush=True)
+
+
+@contextlib.contextmanager
+def _running(
+    attackers: subprocess.Popen[str], kind: str, arguments: list[Any], seconds: float
+) -> Iterator[int]:
+    """Run an attack or a load for the length of the context, by the process that `serve_attacks`
+    runs in; yields the id of its process.
+    """
+    assert attackers.stdin is not None
+    assert attackers.stdout is not None
+    attackers.stdin.write(json.dumps([kind, arguments, seconds]) + "\n")
+    attackers.stdin.flush()
+    begun, pid = attackers.stdout.readline().split()
+    assert begun == "begun"
+    try:
+        yield int(pid)
+    finally:
+        attackers.stdin.write("end\n")
+        attackers.stdin.flush()
+        assert attackers.stdout.readline() == "ended\n"
+
+
+class RunningAttack:
+    """An attack whose load can be measured."""
+
+    def __init__(self, pid: int, endpoint: str, connections: int) -> None:
+        self._pid = pid
+        self._endpoint = endpoint
+        self._connections = connections
+
+    @contextlib.contextmanager
+    def measured(self) -> Iterator[list[Load]]:
+        """Yield a list, to which the load of the attack within the context is added."""
+        loads: list[Load] = []
+        before = Usage.by(self._pid)
+        yield loads
+        after = Usage.by(self._pid)
+        elapsed_s = after.at - before.at
+        loads.append(
+            Load(
+                self._connections,
+                (after.cpu_s - before.cpu_s) / elapsed_s,
+                (after.waits - before.waits) / elapsed_s,
+                is_at_idle_priority(self._endpoint),
+            )
+        )
 
 
 @contextlib.contextmanager
@@ -1110,19 +1234,19 @@ def attacking(
     where: Where,
     connections: int,
     seconds: float = 60.0,
-) -> Iterator[None]:
-    """Attack for the length of the context, by the process that `serve_attacks` runs in."""
-    assert attackers.stdin is not None
-    assert attackers.stdout is not None
-    attackers.stdin.write(json.dumps([endpoint, part, where, connections, seconds]) + "\n")
-    attackers.stdin.flush()
-    assert attackers.stdout.readline() == "begun\n"
-    try:
-        yield
-    finally:
-        attackers.stdin.write("end\n")
-        attackers.stdin.flush()
-        assert attackers.stdout.readline() == "ended\n"
+) -> Iterator[RunningAttack]:
+    """Attack for the length of the context."""
+    with _running(attackers, "attack", [endpoint, part, where, connections], seconds) as pid:
+        yield RunningAttack(pid, endpoint, connections)
+
+
+@contextlib.contextmanager
+def loading(attackers: subprocess.Popen[str], load: Load, seconds: float = 60.0) -> Iterator[int]:
+    """Take the CPU time of an attack for the length of the context, without the attack; yields the
+    id of the process.
+    """
+    with _running(attackers, "load", list(astuple(load)), seconds) as pid:
+        yield pid
 
 
 IMAGE = np.zeros((224, 224, 3), np.uint8)
