@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from vlagents_ray.serve.access.api_keys import Caller
     from vlagents_ray.serve.access.charges import Charge
     from vlagents_ray.serve.engine.admission import MessageAdmission
-    from vlagents_ray.serve.engine.intake import ReceivedReport
 
 logger = logging.getLogger(__name__)
 
@@ -240,6 +239,13 @@ def deliver(answers: Iterable[Answer]) -> None:
         pending.finish(reply)
 
 
+class UncountedReport(Protocol):
+    """A robot's report in a request that is not answered yet."""
+
+    def count(self) -> None:
+        """Add the report to the figures of its session and of the replica."""
+
+
 class Receiver(Protocol):
     """Receives messages with all their replies: a connection, or a caller that waits."""
 
@@ -289,7 +295,7 @@ class IncomingMessage:
         self.arrived = self.decoded_at = time.perf_counter()  # s
         self.replies: list[Reply] = []  # complete when the message is delivered
         # The robots' reports in unanswered requests, by their index.
-        self.reports: dict[int, ReceivedReport] = {}
+        self.reports: dict[int, UncountedReport] = {}
         self.receiver: Receiver  # set by `expect`
         self.sender: Receiver | None = None  # see `expect`
         # Admission that is released before the delivery.
