@@ -36,8 +36,8 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, VLAgentsError, printable
 from vlagents_ray.interface import Agent
 from vlagents_ray.naming import did_you_mean
-from vlagents_ray.ray_tools.signals import delivered
 from vlagents_ray.registry import entries, names, not_installed, pip_install, registered_function
+from vlagents_ray.robot.end_signal import END_SIGNALS, EndSignal, ended_by_signals
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.guard import SOFT_START_S, Guard, measured_state
 from vlagents_ray.robot.leaders import Leader, OpenLeader, leader_named
@@ -100,7 +100,7 @@ def main(arguments: Sequence[str]) -> int:
 
         return drive(options)
     try:
-        with _ended_by_signals() as end_signal:
+        with ended_by_signals(*END_SIGNALS, signal.SIGINT) as end_signal:
             report = _run(options, end_signal)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)  # noqa: T201
@@ -120,7 +120,7 @@ def _run_subcommand(name: str, arguments: Sequence[str]) -> int:
     except VLAgentsError as error:
         print(printable(f"{type(error).__name__}: {error}"), file=sys.stderr)  # noqa: T201
         return 2
-    with _ended_by_signals():
+    with ended_by_signals(*END_SIGNALS, signal.SIGINT):
         return run(arguments)
 
 
@@ -163,53 +163,12 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     return options
 
 
-class _EndSignal:
-    """The signal that ends the command, once it has arrived."""
-
-    def __init__(self) -> None:
-        self._number: int | None = None
-
-    def on_signal(self, number: int, _: object) -> None:
-        """Record the signal, and raise the exception that ends the loop."""
-        # Ignore further signals, which would interrupt the stop.
-        signal.signal(number, signal.SIG_IGN)
-        self._number = number
-        self.raise_if_received()
-
-    def raise_if_received(self) -> None:
-        """Raise the exception again if there was a signal, since Python drops an exception that a
-        handler raises in a destructor.
-        """
-        if self._number == signal.SIGINT:
-            raise KeyboardInterrupt
-        if self._number is not None:
-            sys.exit(128 + self._number)
-
-
-@contextlib.contextmanager
-def _ended_by_signals() -> Iterator[_EndSignal]:
-    """End the loop, and so stop the robot, at SIGTERM (systemd), SIGHUP (a closed terminal) and
-    Ctrl-C.
-    """
-    end_signal = _EndSignal()
-    with contextlib.ExitStack() as undo:
-        if threading.current_thread() is threading.main_thread():
-            undo.enter_context(delivered())
-            for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
-                # Leave ignored signals (such as SIGHUP under nohup) and the caller's own handlers
-                # unchanged.
-                if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-                    before = signal.signal(number, end_signal.on_signal)
-                    undo.callback(signal.signal, number, before)
-        yield end_signal
-
-
 def _say(line: str) -> None:
     """Print a line at once."""
     print(printable(line), flush=True)  # noqa: T201
 
 
-def _run(options: argparse.Namespace, end_signal: _EndSignal) -> LoopReport:
+def _run(options: argparse.Namespace, end_signal: EndSignal) -> LoopReport:
     """Connect to the policy, open the robot, run the control loop, and print the report.
 
     A signal that has arrived ends the loop before its next tick.

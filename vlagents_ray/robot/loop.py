@@ -9,6 +9,7 @@ import json
 import logging
 import math
 import os
+import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -49,6 +50,7 @@ from vlagents_ray.interface import (
 )
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import names, not_installed, registered_class
+from vlagents_ray.robot.end_signal import END_SIGNALS, ended_by_signals
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.guard import Guard
 from vlagents_ray.robot.limits import MotionLimits
@@ -490,8 +492,11 @@ def run_loop(
 
     The schedule is absolute, so there is no drift; a tick whose time has passed before it could
     begin is skipped and counted as missed. If more than half of the ticks had no action of the
-    policy, `LoopReport.mostly_safe` is logged as a warning. A signal such as SIGTERM ends the loop
-    if the caller converts it into an exception.
+    policy, `LoopReport.mostly_safe` is logged as a warning.
+
+    SIGTERM, SIGHUP and SIGUSR1 end the loop with `SystemExit`, as Ctrl-C ends it with
+    `KeyboardInterrupt`, in the main thread of a program without handlers for them. In other threads
+    they end the process at once, and `robot.stop()` is not called.
 
     Args:
         robot: The robot.
@@ -561,7 +566,13 @@ def run_loop(
         fit=fit,
     )
 
+    def is_over() -> bool:
+        end_signal.raise_if_received()
+        return until()
+
     with contextlib.ExitStack() as stack:
+        # SIGUSR1 restarts a robot of the command, and may be sent to any program that drives one.
+        end_signal = stack.enter_context(ended_by_signals(*END_SIGNALS, signal.SIGUSR1))
         control.begin(auto=restart == "auto")
         try:
             obs = _observed(robot)
@@ -589,7 +600,7 @@ def run_loop(
                 stack.enter_context(watchdog)
 
             pacer = Pacer(hz)
-            run.drive(pacer, seconds, until)
+            run.drive(pacer, seconds, is_over)
             run.go_to_rest(pacer)
 
             report.outcome = control.end()
