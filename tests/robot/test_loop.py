@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -569,3 +570,37 @@ def test_the_simulated_robot_gives_what_a_contract_asks_for() -> None:
     assert first.gripper is not None
     assert last.gripper is not None
     assert last.gripper > first.gripper
+
+
+ROBOT_OF_A_LIBRARY = """
+import atexit
+from vlagents_ray.robot.loop import opened
+
+class Renderer:
+    def __del__(self):
+        print("the renderer is freed", flush=True)
+
+class Arm:
+    def __init__(self):
+        self.cycle = [self, Renderer()]
+
+    def observe(self):
+        atexit.register(print, "the library ends", flush=True)
+
+def run():
+    with opened(Arm) as robot:
+        robot.observe()
+
+run()
+"""
+
+
+def test_a_robot_without_close_is_freed_before_its_libraries_end() -> None:
+    """MuJoCo's renderers print a traceback if EGL has ended before they are freed."""
+    done = subprocess.run(
+        [sys.executable, "-c", ROBOT_OF_A_LIBRARY],
+        capture_output=True, text=True, timeout=60, check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )  # fmt: skip
+    assert done.stdout.splitlines() == ["the renderer is freed", "the library ends"]
+    assert done.stderr == ""

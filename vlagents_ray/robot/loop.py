@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import gc
 import importlib
@@ -278,6 +279,15 @@ def robot_factory(option: str, name: str, settings: Iterable[str] = ()) -> Calla
     return partial(make, **arguments)
 
 
+def _free_robots() -> None:
+    """Free robots that nothing uses any longer, with all that they refer to.
+
+    A renderer of a robot without `close` cannot be freed after its library has ended, and prints a
+    traceback.
+    """
+    gc.collect()
+
+
 @contextlib.contextmanager
 def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
     """Make a robot, yield it, and close it at the end.
@@ -303,6 +313,10 @@ def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
         ) from error
 
     with contextlib.ExitStack() as stack:
+        # It is registered after the exit functions of the robot's libraries, and so called before
+        # them.
+        stack.callback(atexit.register, _free_robots)
+        stack.callback(atexit.unregister, _free_robots)
         if isinstance(robot, contextlib.AbstractContextManager):
             stack.enter_context(robot)
         else:
