@@ -1,4 +1,6 @@
-"""The tokens of a step of π0: one of the state, and one of each noisy action with the flow time."""
+"""The tokens of a flow step of π0: one token for the state, and one token for each noisy action
+with the flow time.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +10,8 @@ from typing import Any
 def action_tokens(layers: Any, state: Any, actions: Any, time: Any) -> Any:
     """Return the embeddings of the tokens of a step, (B, 1 + H, D).
 
-    transformers, openpi and LeRobot embed the state and the time in each step. They are arguments
-    here, as they can be computed once for a flow.
+    transformers, openpi and LeRobot embed the state and the time in each step. Here, these
+    embeddings are arguments, since they can be computed once for a whole flow.
 
     Args:
         layers: The module with `action_in_proj`, `action_time_mlp_in` and `action_time_mlp_out`.

@@ -1,5 +1,5 @@
-"""The setting of how the steps of a flow compute attention, which π0 and π0.5 of transformers,
-openpi and LeRobot have in common.
+"""The setting that selects the attention kernel of the flow's steps, for π0 and π0.5 of
+transformers, openpi and LeRobot.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from vlagents_ray_models.gemma_layers import Attention
 
 
 class AttentionConfig(ModelConfig):
-    """Settings of a family that runs `GemmaLayers`, in addition to those of all models."""
+    """Settings of a family that runs `GemmaLayers`, in addition to the settings of all models."""
 
     attention: Attention = Field(
         default="sdpa",
         description="attention of the flow's steps of π0 and π0.5 in PyTorch: torch's "
-        "scaled_dot_product_attention, or flex_attention, whose kernel torch.compile makes: it "
-        "needs `compile` true, max or require",
+        "scaled_dot_product_attention, or flex_attention, which torch.compile turns into a "
+        "kernel: it needs `compile` true, max or require",
     )
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Diffusion Policy, with the sessions' real past frames and their own noise."""
+"""The policy Diffusion Policy. Each session has its own history of frames and its own noise."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from vlagents_ray_models.model_code import use_source
 
 
 class DiffusionPolicyConfig(ModelConfig):
-    """Settings of Diffusion Policy, in addition to those of all models."""
+    """Settings of Diffusion Policy, in addition to the settings of all models."""
 
     checkpoint: str = Field(
         min_length=1,
-        description="a .ckpt file, or a folder or hub id (org/name@COMMIT) with only one; `{step}` "
-        "stands for checkpoint_step",
+        description="a .ckpt file, or a folder or hub id (org/name@COMMIT) with a single .ckpt "
+        "file; `{step}` stands for checkpoint_step",
     )
     trust_checkpoint: bool = Field(
         default=False,
@@ -50,7 +50,7 @@ class DiffusionPolicyConfig(ModelConfig):
     actions: Literal["chunk", "queue", "ensemble"] = Field(
         default="queue",
         description="as in all models; 'queue' by default, because the model reads the last "
-        "frames, including those within a chunk, which it gets only if each of them is sent",
+        "frames, including the frames within a chunk, so that each frame must be sent",
     )
     state: list[str] | None = Field(
         default=None,
@@ -62,12 +62,12 @@ class DiffusionPolicyConfig(ModelConfig):
     )
 
 
-USUAL_CAMERAS = {  # names of the authors' tasks -> ours
+USUAL_CAMERAS = {  # camera name in the authors' tasks -> our camera
     "image": "front",
     "agentview_image": "front",
     "robot0_eye_in_hand_image": "wrist",
 }
-_POSE_NUMBERS = 10  # position, rotation in six numbers, gripper
+_POSE_NUMBERS = 10  # position (3), 6D rotation (6), gripper (1)
 
 
 class DiffusionPolicy(ModelPolicy):
@@ -113,13 +113,15 @@ class DiffusionPolicy(ModelPolicy):
     def load(self) -> DiffusionNetwork:
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         network = DiffusionNetwork.load(self.config)
-        self._cameras(network)  # raises unless the configured cameras fit
+        self._cameras(network)  # raises an error unless the configured cameras fit
         if self.config.compile_on(network.staging.device.type):
             compile_with(network, self.compilation)
         return network
 
     def perceive(self, obs: Obs) -> StagedRow:
-        """Return images (H, W, 3) uint8 and vectors (D,) float32 by the checkpoint's names."""
+        """Return images, (H, W, 3) uint8, and vectors, (D,) float32, under the checkpoint's
+        names.
+        """
         network: DiffusionNetwork = self.model
         inputs: dict[str, np.ndarray] = {}
         for name, image in camera_images(obs, self._cameras(network)).items():
@@ -133,7 +135,7 @@ class DiffusionPolicy(ModelPolicy):
         return network.staging.stage(inputs)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """Compute the chunks of all rows in one call of the module, each with its own noise."""
+        """Compute the chunks of all rows in one call of the module. Each row has its own noise."""
         from vlagents_ray_models.sampling_rng import RowNoise
 
         network: DiffusionNetwork = self.model
@@ -148,14 +150,14 @@ class DiffusionPolicy(ModelPolicy):
         for name in network.images:  # (B, T, H, W, 3) uint8 -> (B, T, 3, H, W) in [0, 1]
             inputs[name] = inputs[name].movedim(-1, 2).float() / 255
 
-        # The scheduler's steps draw their noise in this module of diffusers.
+        # The scheduler's steps draw noise in this module of diffusers.
         drawing_modules = (network.module, require("diffusers.utils.torch_utils"))
         with torch.inference_mode(), RowNoise(rows, network.draws, *drawing_modules):
             actions = network.module.predict_action(inputs)["action"]
         return [Prediction(chunk) for chunk in fetch(actions.float())]
 
     def _state_parts(self, network: DiffusionNetwork) -> list[str]:
-        """Return the parts of our state, in the order of the checkpoint's vectors."""
+        """Return the parts of the robot's state, in the order of the checkpoint's vectors."""
         if self.config.state is not None:
             return self.config.state
         return ["state" if name == OBS else name for name in network.vectors]
@@ -167,8 +169,8 @@ class DiffusionPolicy(ModelPolicy):
 
 
 def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Scale an (H, W, 3) uint8 image to (height, width, 3), and crop its centre to the model's
-    aspect ratio, as the authors' get_real_obs_dict does.
+    """Scale an image, (H, W, 3) uint8, to (height, width, 3), and crop its centre to the model's
+    aspect ratio, as get_real_obs_dict of the authors does.
     """
     if image.shape[:2] == (height, width):
         return image.copy()
@@ -179,16 +181,17 @@ def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _action_spec(dim: int, *, absolute: bool) -> ActionSpec:
-    """Describe the actions. With `abs_action` they are one or two poses in the base frame, with
-    6D rotations.
+    """Describe the actions.
+
+    With `abs_action`, an action contains one or two poses in the base frame, with 6D rotations.
     """
     if not absolute or dim % _POSE_NUMBERS:
         return ActionSpec(dim=dim)
     return ActionSpec(dim=dim, space="ee_pose", delta=False, rotation="rot6d", frame="base")
 
 
-OBS = "obs"  # the only input of a policy without cameras
-# The setting of the training that names initial weights of the image encoder.
+OBS = "obs"  # name of the only input of a policy without cameras
+# The training setting that names the initial weights of the image encoder.
 _INITIAL_WEIGHTS = "policy.obs_encoder.rgb_model.weights"
 
 
@@ -198,18 +201,18 @@ class DiffusionNetwork:
 
     module: Any
     staging: Staging
-    images: dict[str, tuple[int, int]]  # height and width, by the checkpoint's name
-    vectors: dict[str, int]  # length, by the checkpoint's name, in its order
+    images: dict[str, tuple[int, int]]  # name in the checkpoint -> height and width
+    vectors: dict[str, int]  # name in the checkpoint -> length, in the checkpoint's order
     # Whether actions are poses with 6D rotations, as in the robomimic tasks with `abs_action`.
     absolute: bool
-    draws: int  # draws of noise that are made together for a pass, which may need more
+    draws: int  # number of draws of noise that are made together; a forward pass may need more
 
     @classmethod
     def load(cls, config: DiffusionPolicyConfig) -> DiffusionNetwork:
         """Read the checkpoint.
 
         Raises:
-            ConfigError: It is not trusted, incomplete, or of another family.
+            ConfigError: The checkpoint is not trusted, is incomplete, or belongs to another family.
         """
         if not config.trust_checkpoint:
             raise ConfigError(
@@ -253,7 +256,7 @@ def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
     """Find the .ckpt file.
 
     Raises:
-        ConfigError: There is no such file or more than one, or the checkpoint is a hub id without
+        ConfigError: There is no .ckpt file or more than one, or the checkpoint is a hub id without
             a commit, whose pickle may change.
     """
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
@@ -279,15 +282,16 @@ def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
 
 
 def _read_payload(path: Path) -> tuple[Any, Mapping[str, Any]]:
-    """Return the settings of the training and the weights, which are the averaged ones if the
-    training computed such.
+    """Return the settings of the training and the weights.
+
+    These are the averaged weights if the training computed them.
     """
     torch = require("torch")
     dill = require("dill")
     try:
         payload = torch.load(path, map_location="cpu", pickle_module=dill, weights_only=False)
         settings, states = payload["cfg"], payload["state_dicts"]
-    except Exception as error:  # unpickling can raise any exception
+    except Exception as error:  # Unpickling can raise any exception.
         raise ConfigError(
             f"checkpoint {path}: expected a .ckpt that save_checkpoint of a Diffusion Policy "
             f"workspace wrote, got no such payload ({type(error).__name__}: {error})"
@@ -307,11 +311,12 @@ def _make_module(path: Path, settings: Any) -> Any:
     """Make the policy's module from the settings of its training.
 
     Raises:
-        ConfigError: It is no diffusion policy, or crops images at random during inference.
+        ConfigError: The module is not a diffusion policy, or crops images at random during
+            inference.
     """
     omegaconf = require("omegaconf").OmegaConf
     if omegaconf.select(settings, _INITIAL_WEIGHTS) not in (None, "r3m", "R3M"):
-        # The initial weights of the training would be downloaded, only to be replaced.
+        # The initial weights of the training would be downloaded, although they are replaced later.
         omegaconf.update(settings, _INITIAL_WEIGHTS, None)
 
     module = require("hydra.utils").instantiate(settings.policy)
@@ -354,7 +359,7 @@ def _sample_without_waiting(module: Any, device: Any) -> None:
     """
     scheduler = module.noise_scheduler
     scheduler.set_timesteps(module.num_inference_steps)
-    # A class from elsewhere may define a different loop.
+    # A class that is not from the authors' package may define another loop.
     if type(module).conditional_sample.__module__.startswith("diffusion_policy."):
         module.conditional_sample = partial(
             _conditional_sample, module, scheduler.timesteps.to(device)
@@ -362,7 +367,10 @@ def _sample_without_waiting(module: Any, device: Any) -> None:
 
 
 def _noise_draws(module: Any) -> int:
-    """Return how many times a pass draws noise, once the scheduler's time steps are set."""
+    """Return how many times a forward pass draws noise.
+
+    The scheduler's time steps must be set before.
+    """
     scheduler = module.noise_scheduler
     if "variance_type" not in scheduler.config:
         return 1
@@ -382,14 +390,14 @@ def _conditional_sample(
 ) -> Any:
     """Denoise as the module's `conditional_sample` does, without waiting for a GPU.
 
-    The module's own loop waits in each step: it copies the time to the device, and indexes by
-    truth values.
+    The module's own loop waits in each step: it copies the time to the device, and indexes with
+    boolean masks.
 
     Args:
         module: The policy's module.
         times: The scheduler's time steps, on the device.
-        data: (B, T, D), the values that are not denoised.
-        known: (B, T, D) bool, where `data` applies.
+        data: The known values, which are not denoised, (B, T, D).
+        known: Where values are known, (B, T, D) bool.
         generator: The generator of the scheduler's noise.
         cond: The observations, unless `options` has "local_cond" or "global_cond".
         options: Further arguments of the network and of the scheduler's `step`.
@@ -410,7 +418,8 @@ def _conditional_sample(
     noise = randn(data.shape, device=data.device, dtype=data.dtype)
     sample = torch.where(known, data, noise)
 
-    # The network reads the time on the device; the scheduler branches on its time on the CPU.
+    # The network reads the time on the device, while the scheduler branches on a copy of the time
+    # on the CPU.
     scheduler.set_timesteps(module.num_inference_steps)
     for time, device_time in zip(scheduler.timesteps, times, strict=True):
         output = module.model(sample, device_time, **conditions)
@@ -419,7 +428,7 @@ def _conditional_sample(
     return sample
 
 
-# The flag of a module -> the argument of its network that takes the observations.
+# The flag of a module -> the argument with which its network receives the observations.
 _CONDITIONS = {
     "obs_as_cond": "cond",
     "obs_as_local_cond": "local_cond",
@@ -451,12 +460,13 @@ def compile_with(network: DiffusionNetwork, compilation: Compilation) -> None:
 def _compiled_denoiser(
     forward: Callable[..., Any], condition: str, compilation: Compilation
 ) -> Callable[..., Any]:
-    """Return the denoising network as its loop calls it; `condition` is the name of its argument
-    for observations.
+    """Return the compiled denoising network as a function that the denoising loop can call.
+
+    `condition` is the name of its argument for observations.
     """
 
     def denoise(sample: Any, times: Any, *observations: Any) -> Any:
-        # There are no observations where the sample contains them.
+        # Without a condition, the sample itself contains the observations.
         return forward(sample, times, **dict(zip([condition], observations, strict=False)))
 
     core = compilation.core("denoise", denoise)
@@ -472,8 +482,9 @@ def _compiled_denoiser(
 def _compiled_encoder(
     forward: Callable[..., Any], names: list[str], steps: int, compilation: Compilation
 ) -> Callable[[Mapping[str, Any]], Any]:
-    """Return the encoder of frames (B * steps, …) by name, whose compiled core takes rows of
-    `steps` frames.
+    """Return the compiled encoder of named frames, (B * steps, …).
+
+    Its core processes rows of `steps` frames.
     """
 
     def encode_images(*frames: Any) -> Any:
@@ -496,12 +507,12 @@ def _replace_branches_on_values(module: Any, device: Any) -> None:
     torch = require("torch")
     transforms = require("torchvision.transforms")
     for layer in module.modules():
-        if isinstance(layer, transforms.Normalize):  # checks for a std of 0
+        if isinstance(layer, transforms.Normalize):  # it checks for a std of 0
             mean = torch.tensor(layer.mean, device=device).view(-1, 1, 1)
             std = torch.tensor(layer.std, device=device).view(-1, 1, 1)
             layer.forward = partial(_normalised, mean, std)
         elif isinstance(layer, torch.nn.TransformerDecoder):
-            # checks whether its mask is causal, for a faster kernel
+            # The layer checks whether its mask is causal, to select a faster kernel.
             layer.forward = partial(layer.forward, tgt_is_causal=False)
         elif isinstance(layer, torch.nn.TransformerEncoder):
             layer.forward = partial(layer.forward, is_causal=False)

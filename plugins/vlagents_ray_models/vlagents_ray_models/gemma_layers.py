@@ -1,17 +1,17 @@
-"""The layers of a Gemma, with keys and values as tensors.
+"""The layers of a Gemma model, with keys and values as tensors.
 
 The forward passes of transformers and of openpi build masks, position embeddings and a cache in
-each call. In a flow, they are the same in each step: `Pi0HfPasses` and `Pi0Passes` compute them
-once, and call the layers with them. The layers are those of transformers' `GemmaModel`, and those
-of openpi and LeRobot, which add conditions and gates to its norms.
+each call. These are the same in each step of a flow: `Pi0HfPasses` and `Pi0Passes` compute them
+once, and call the layers with them. The functions support the layers of transformers' `GemmaModel`,
+and the layers of openpi and LeRobot, which add conditions and gates to the norms. A norm multiplies
+by `1 + weight`, and an adaptive norm by a factor that it computes from a condition. These factors
+are the norm's *modulation*, an argument of the layers here. The modulation of all norms is computed
+together, once for each flow. It is not kept between flows, so that pushed weights take effect
+without a further step.
 
-A norm multiplies by `1 + weight`, and an adaptive norm by what it computes from a condition. Both
-are arguments of the layers here, its *modulation*: they are computed for all norms at once, once
-for each flow. They are not kept between flows, so that pushed weights need no further step.
-
-Attention is torch's own (`scaled_dot_product_attention`). Masks are added to its scores, since its
-kernels would convert a mask of truth values in each call. `flex_attention` makes a kernel for them
-instead, which also divides the keys of a few queries among the processors of a GPU.
+Attention is torch's own (`scaled_dot_product_attention`). Masks are added to the attention scores,
+since torch's kernels would convert a boolean mask in each call. With `flex_attention`, torch makes
+a kernel for the masks, which also divides the keys of a few queries among the processors of a GPU.
 """
 
 from __future__ import annotations
@@ -26,12 +26,15 @@ Attention = Literal["sdpa", "flex"]
 
 # Torch's kernels copy a mask in each call, unless its rows begin at multiples of this number.
 _ALIGNED = 8
-# Attribute of an attention or an MLP: the weights of several of its linear layers as one tensor.
+# The attribute of an attention or an MLP module that contains the weights of several of its linear
+# layers as one tensor.
 _MERGED = "merged_weight"
 
 
 class GemmaLayers:
-    """The passes of a `GemmaModel` over a prefix, and over the tokens of the steps of a flow."""
+    """The forward passes of a `GemmaModel` over a prefix, and over the tokens of each step of a
+    flow.
+    """
 
     def __init__(self, model: Any, compilation: Compilation, attention: Attention = "sdpa") -> None:
         """Use the layers of a model, each of which becomes a region of the compiled cores.
@@ -39,7 +42,7 @@ class GemmaLayers:
         Args:
             model: The `GemmaModel`.
             compilation: Compiles the cores.
-            attention: How compiled steps compute attention.
+            attention: The attention kernel of compiled steps.
         """
         self.model = model
         self.attention: Attention = attention
@@ -47,12 +50,14 @@ class GemmaLayers:
         self._norm = compilation.region(_normed)
 
     def merge_products(self) -> None:
-        """Let each layer compute queries, keys and values in one product, and gate and up in one.
+        """Let each layer compute queries, keys and values in one product, and `gate_proj` and
+        `up_proj` in one product.
 
         The parameters become views of one tensor for each product, with the names, shapes and
-        values that they had. Values that are copied into their memory therefore also change the
-        product, as pushed weights on a GPU do. On a CPU these replace the parameters, and must not
-        be pushed after this call. Layers must not have adapters, nor be quantized.
+        values that they had. Pushed weights on a GPU are copied into the memory of the parameters,
+        and therefore also change the merged tensor. On a CPU, pushed weights replace the
+        parameters, so no weights may be pushed after this call. Layers must have no adapters, and
+        must not be quantized.
         """
         for layer in self.model.layers:
             attention, mlp = layer.self_attn, layer.mlp
@@ -83,7 +88,7 @@ class GemmaLayers:
             condition: (B, C), or (B, S, C) with a condition for each token.
 
         Returns:
-            Factor, summand and gate of each norm, (B, norms, 3, 1 or S, D) float32.
+            The factor, summand and gate of each norm, (B, norms, 3, 1 or S, D) float32.
         """
         import torch
 
@@ -104,13 +109,13 @@ class GemmaLayers:
         """Return keys and values of a prefix, (P, layers, 2, heads, L, E).
 
         Args:
-            embedded: The embeddings of its tokens, (P, L, D).
+            embedded: The embeddings of the prefix tokens, (P, L, D).
             present: Whether each token is no padding, (P, L).
         """
         import torch  # torch's compiler follows this statement, but not `require`
 
         hidden = self._in_type_of_weights(embedded)
-        # All tokens attend to those that are present.
+        # All tokens attend to the tokens that are present.
         mask = _additive_mask(present.bool()[:, None, None], hidden.dtype)
         rotation = self._rotation(hidden, present.long().cumsum(-1) - 1)
 
@@ -121,7 +126,7 @@ class GemmaLayers:
             of_layer = scales[2 * number : 2 * number + 2]
             hidden, keys, values = self._layer(layer, hidden, mask, rotation, of_layer)
             keys_and_values.append(torch.stack([keys, values], 1))
-        # The rest of the last layer is not needed.
+        # Only the keys and values of the last layer are needed.
         normed = _normed(last_layer.input_layernorm, hidden, scales[2 * len(layers)])
         _, keys, values = _heads(last_layer.self_attn, normed, rotation)
         keys_and_values.append(torch.stack([keys, values], 1))
@@ -130,15 +135,15 @@ class GemmaLayers:
     def constants(
         self, encoded: Any, present: Any, tokens: int, *, has_state: bool
     ) -> tuple[Any, Any, Any]:
-        """Compute what all steps of a flow need of the prefix.
+        """Compute the inputs from the prefix that all steps of a flow share.
 
         Args:
-            encoded: The result of `encode`, by another `GemmaModel` with the same heads, for the B
+            encoded: The result of `encode` of another `GemmaModel` with the same heads, for the B
                 rows.
             present: Whether each token of the prefix is no padding, (B, L).
             tokens: The number of tokens of a step, S.
-            has_state: Whether the first of them is that of the state, which does not attend to the
-                others.
+            has_state: Whether the first token is the token of the state, which does not attend to
+                the other tokens of the step.
 
         Returns:
             The first three arguments of `step`.
@@ -227,13 +232,14 @@ def gemma_layer(
         hidden: Hidden states, (B, S, D).
         mask: It is added to the scores, (B, 1, 1 or S, L'); L' may exceed the number of keys.
         rotation: Cosines and signed sines of the positions, (B, 2, S, E).
-        factors: Those of both norms, see `_normed`: (2, D), or (2, B, 2, 1 or S, D) for adaptive
-            norms.
-        prefix: Keys and values of earlier tokens, to which these ones attend as well,
-            (B, 2, heads, L, E), or None.
+        factors: The factors of both norms, see `_normed`: (2, D), or (2, B, 2, 1 or S, D) for
+            adaptive norms.
+        prefix: The keys and values of earlier tokens, to which these tokens also attend, (B, 2,
+            heads, L, E), or None.
         gates: The gates of the branches that begin with adaptive norms, (2, B, 1 or S, D), or None.
-        uses_flex: Whether a compiled layer computes attention by `flex_attention`. An eager layer
-            never does, so that the comparison of both is also one of the two kinds of attention.
+        uses_flex: Whether a compiled layer computes attention with `flex_attention`. An eager layer
+            never does, so that the comparison of the compiled layer with the eager one also
+            compares the two attention kernels.
 
     Returns:
         The new hidden states, and the keys and values of these tokens, (B, heads, S, E) each.
@@ -259,7 +265,9 @@ def gemma_layer(
 
 
 def compile_vision_layers(model: Any, compilation: Compilation) -> None:
-    """Let each layer of the SigLIP of a `PaliGemmaModel` be a region of the compiled cores."""
+    """Make each layer of the SigLIP encoder of a `PaliGemmaModel` a region of the compiled
+    cores.
+    """
     tower = model.vision_tower
     layers = getattr(tower, "vision_model", tower).encoder.layers
     region = compilation.region(type(layers[0]).forward)
@@ -268,7 +276,7 @@ def compile_vision_layers(model: Any, compilation: Compilation) -> None:
 
 
 def _additive_mask(is_visible: Any, dtype: Any) -> Any:
-    """Return a mask that is added to scores.
+    """Return a mask that is added to attention scores.
 
     Args:
         is_visible: Whether each query attends to each key, (B, 1, 1 or S, keys).
@@ -287,7 +295,7 @@ def _additive_mask(is_visible: Any, dtype: Any) -> Any:
 
 
 def _scales(norms: Sequence[Any]) -> Any:
-    """Return the factors of norms, (norms, D) float32; their weights are these minus 1."""
+    """Return the factors of norms, (norms, D) float32: their weights plus 1."""
     import torch
 
     return torch.stack([norm.weight for norm in norms]).float() + 1
@@ -296,8 +304,8 @@ def _scales(norms: Sequence[Any]) -> Any:
 def _normed(norm: Any, hidden: Any, factors: Any) -> Any:
     """Return normed hidden states, (B, S, D).
 
-    They are computed in float32, as in the norms of transformers and openpi. Torch's kernel needs
-    a weight of the same type, and computes what is six operations otherwise.
+    They are computed in float32, as in the norms of transformers and openpi. Torch's kernel, which
+    needs a weight of the same type, replaces six operations.
 
     Args:
         norm: The norm, of which only the epsilon is read.
@@ -323,9 +331,9 @@ def _added(hidden: Any, change: Any, gate: Any) -> Any:
 
 
 def _merge(owner: Any, linears: Sequence[Any]) -> None:
-    """Merge the weights of linear layers without biases, and keep them as an attribute of `owner`.
+    """Merge the weights of linear layers without biases, and store them in an attribute of `owner`.
 
-    Layers with biases stay as they are.
+    Layers with biases stay unchanged.
     """
     import torch
 
@@ -340,7 +348,7 @@ def _merge(owner: Any, linears: Sequence[Any]) -> None:
 
 
 def _heads(attention: Any, normed: Any, rotation: Any) -> tuple[Any, Any, Any]:
-    """Return queries, keys and values, (B, heads, S, E) each; the first two are rotated."""
+    """Return queries, keys and values, (B, heads, S, E) each. Queries and keys are rotated."""
     from torch.nn.functional import linear
 
     by_head = (*normed.shape[:-1], -1, attention.head_dim)
@@ -392,7 +400,9 @@ def _attended(queries: Any, keys: Any, values: Any, mask: Any, scaling: float) -
 
 
 def _flexibly_attended(queries: Any, keys: Any, values: Any, mask: Any, scaling: float) -> Any:
-    """Return the result of attention, (B, S, heads * E), by a kernel that torch makes for it."""
+    """Return the result of attention, (B, S, heads * E), computed with a kernel of
+    `flex_attention`.
+    """
     from torch.nn.attention.flex_attention import flex_attention
 
     def masked(score: Any, row: Any, _head: Any, query: Any, key: Any) -> Any:
@@ -405,6 +415,9 @@ def _flexibly_attended(queries: Any, keys: Any, values: Any, mask: Any, scaling:
 
 
 def _shared_by(heads: Any, count: int) -> Any:
-    """Repeat each head of keys or values for `count` heads of queries; one head becomes a view."""
+    """Repeat each head of keys or values for `count` heads of queries.
+
+    A single head becomes a view.
+    """
     rows, kept, length, width = heads.shape
     return heads[:, :, None].expand(rows, kept, count, length, width).flatten(1, 2)

@@ -41,7 +41,7 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.model_code import remote_code, use_source
 
 CONFIG, STATISTICS = "processor_config.json", "statistics.json"
-# Relative representations of actions -> whether decoded actions are deltas.
+# Relative representation of actions -> whether decoded actions are deltas.
 _RELATIVE = {"RELATIVE": False, "DELTA": True}
 _SPACES = {"NON_EEF": "joint", "EEF": "ee_pose"}
 _ROTATIONS = {"XYZ_ROT6D": "rot6d", "XYZ_ROTVEC": "axis_angle"}
@@ -52,15 +52,16 @@ _CURE = "save the checkpoint's processor with its dataset's statistics, as GR00T
 class Embodiment:
     """The inputs and the actions of one robot of a checkpoint."""
 
-    value: str  # its name, which GR00T's code reads from this field, as from an `EmbodimentTag`
+    # Name of the embodiment; GR00T's code reads it from this field, as from an `EmbodimentTag`.
+    value: str
     cameras: tuple[str, ...]
     state: Mapping[str, int]  # groups and their widths, in the model's order
-    action: Mapping[str, int]  # as `state`
+    action: Mapping[str, int]  # groups and their widths, like `state`
     # For "video" and "state", the offsets of the observations that are read; 0 is the newest.
     offsets: Mapping[str, tuple[int, ...]]
     horizon: int  # rows of a chunk
     spec: ActionSpec
-    # Bounds of the training's "state" and "action", by group, in the robot's units.
+    # Bounds of "state" and "action" in training, by group, in the robot's units.
     ranges: Mapping[str, Any]
 
     @property
@@ -74,10 +75,10 @@ class Embodiment:
 
         Args:
             folder: The folder with the processor's configuration and its statistics.
-            name: The name of the embodiment; None: the only one that has statistics.
+            name: The name of the embodiment; None selects the only one with statistics.
 
         Raises:
-            ConfigError: A file or a statistic is missing, or `name` does not decide on one
+            ConfigError: A file or a statistic is missing, or `name` does not identify one
                 embodiment.
         """
         settings, statistics = _read_processor(folder)
@@ -133,7 +134,7 @@ def _read_processor(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))["processor_kwargs"]
         statistics = json.loads((folder / STATISTICS).read_text(encoding="utf-8"))
-        settings["modality_configs"]  # raises KeyError if there are none
+        settings["modality_configs"]  # raises KeyError if there are no statistics
     except FileNotFoundError as error:
         files = sorted(file.name for file in folder.iterdir())
         raise ConfigError(
@@ -150,7 +151,10 @@ def _read_processor(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def _choose_embodiment(
     name: str | None, configs: Mapping[str, Any], statistics: Mapping[str, Any]
 ) -> str:
-    """Return the name if that embodiment has statistics; for None, the only one that has."""
+    """Return the name if the embodiment has statistics.
+
+    With None, return the only embodiment with statistics.
+    """
     usable = sorted(set(configs) & set(statistics))
     if name is None and len(usable) == 1:
         return usable[0]
@@ -168,7 +172,7 @@ def _bounds(
     group: str,
     bound_names: tuple[str, str],
 ) -> dict[str, list[float]]:
-    """Return the bounds of a group by their names.
+    """Return the bounds of a group under their names.
 
     Args:
         folder: The folder of the processor, for messages.
@@ -199,15 +203,15 @@ def _bounds(
 
 
 def _action_spec(groups: Any, dim: int, *, converts: bool) -> ActionSpec:
-    """Describe the actions by their relative groups.
+    """Describe the actions from their relative groups.
 
-    Checkpoints call all other groups absolute, even displacements such as LIBERO's, so the
-    contract does not declare these.
+    Checkpoints call all other groups absolute, even displacements such as LIBERO's, so the contract
+    does not describe these groups.
 
     Args:
         groups: The checkpoint's description of each group.
-        dim: How many numbers an action has.
-        converts: Whether GR00T converts relative groups to absolute ones, as it does if the
+        dim: The number of values of an action.
+        converts: Whether GR00T converts relative groups to absolute ones, which it does if the
             processor has `use_relative_action`.
     """
     relative = [group for group in groups if converts and group["rep"] in _RELATIVE]
@@ -225,7 +229,7 @@ def _action_spec(groups: Any, dim: int, *, converts: bool) -> ActionSpec:
 
 
 class Gr00tConfig(ModelConfig):
-    """Settings of GR00T, in addition to those of all models."""
+    """Settings of GR00T, in addition to the settings of all models."""
 
     checkpoint: str = Field(
         min_length=1,
@@ -273,7 +277,7 @@ class Gr00tInputs:
     """The inputs of one row."""
 
     processed: Any  # the result of the checkpoint's processor
-    state: dict[str, np.ndarray]  # (T, D) float32 by group, from which actions are decoded
+    state: dict[str, np.ndarray]  # states (T, D) float32 by group, needed to decode the actions
 
 
 @dataclass(frozen=True)
@@ -283,8 +287,8 @@ class Gr00tNetwork:
     model: Any
     processor: Any
     embodiment: Embodiment
-    # One thread at a time may use the processor: its transforms store their parameters, and it
-    # changes the warning filters of the whole process.
+    # Only one thread at a time may use the processor, since its transforms store their parameters,
+    # and it changes the warning filters of the whole process.
     reading: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
     @classmethod
@@ -292,7 +296,7 @@ class Gr00tNetwork:
         """Read a checkpoint.
 
         Raises:
-            ConfigError: A file or a weight of it is missing, or it is of another version or
+            ConfigError: A file or a weight is missing, or the checkpoint has another version or
                 embodiment.
         """
         code = _use_checkout(config.source_dir)
@@ -305,7 +309,7 @@ class Gr00tNetwork:
 
         device = torch_device(config.device)
         dtype = torch_dtype(config.dtype, device)
-        # flash-attention computes 16-bit numbers on GPUs only.
+        # flash-attention supports only 16-bit numbers on GPUs.
         uses_flash = (
             device.type == "cuda"
             and dtype.itemsize == 2
@@ -361,7 +365,7 @@ class Gr00tNetwork:
 
     @cached_property
     def masks_padding(self) -> bool:
-        """Whether all layers above the language model mask padding, as N1.6's usual transformer
+        """Whether all layers above the language model mask padding, as N1.6's default transformer
         does.
         """
         layers = getattr(self.model.action_head, "vl_self_attention", None)
@@ -405,8 +409,9 @@ class Gr00tNetwork:
     def compute_chunks(
         self, rngs: Sequence[np.random.Generator], inputs: Sequence[Gr00tInputs]
     ) -> list[np.ndarray]:
-        """Compute the chunks of rows in one pass, or in one pass for each length of a prompt if
-        the model does not mask padding.
+        """Compute the chunks of rows in one forward pass.
+
+        If the model does not mask padding, each prompt length needs a separate pass.
 
         Args:
             rngs: The generator of each row's noise.
@@ -438,7 +443,7 @@ class Gr00tNetwork:
         """Compute the chunks of the rows whose inputs `batch` contains."""
         from vlagents_ray_models.sampling_rng import RowDraws
 
-        # GR00T's own code would copy from pageable memory, and wait for the GPU.
+        # Otherwise, GR00T's own code would copy from pageable memory, and wait for the GPU.
         torch, pytree = require("torch"), require("torch.utils._pytree")
         uploaded = pytree.tree_map_only(torch.Tensor, self.staging.upload, dict(batch["inputs"]))
         with torch.inference_mode(), RowDraws(rngs, self.model.action_head):
@@ -453,8 +458,8 @@ class Gr00tNetwork:
 
 
 def _processor_folder(folder: Path) -> Path:
-    """Return the folder of a checkpoint's processor: its own, or the one beneath it where N1.7's
-    training saves it.
+    """Return the folder of a checkpoint's processor: the checkpoint's folder, or the subfolder in
+    which N1.7's training saves the processor.
     """
     beneath = folder / "processor"
     return folder if (folder / CONFIG).is_file() or not beneath.is_dir() else beneath
@@ -467,7 +472,7 @@ def _use_checkout(source_dir: str | None) -> Path:
         The folder of its models, whose code transformers imports.
 
     Raises:
-        ConfigError: It is not found, or of N1.5 or an earlier version.
+        ConfigError: The code is not found, or is the code of N1.5 or an earlier version.
     """
     use_source("gr00t", SOURCE, source_dir)
     if importlib.util.find_spec("gr00t.policy") is None:
@@ -476,7 +481,7 @@ def _use_checkout(source_dir: str | None) -> Path:
             "N1.7, got that of N1.5 or before; serve N1.5 by its own server, and the policy "
             "`upstream` in front of it"
         )
-    # Otherwise its import queries PyPI for a newer version.
+    # Otherwise, importing the package would query PyPI for a newer version.
     os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")
     ensure_torchvision()
     return Path(str(require("gr00t.model").__file__)).parent
@@ -485,8 +490,8 @@ def _use_checkout(source_dir: str | None) -> Path:
 def _moved(model: Any, saved: SavedTensors, device: Any, dtype: Any) -> Any:
     """Move a model to a device and a dtype.
 
-    GR00T's code reads N1.6's backbone in bfloat16, which rounds its weights. If the model computes
-    in another type, they are copied from the checkpoint again.
+    GR00T's code reads N1.6's backbone in bfloat16, which rounds the backbone's weights. If the
+    model computes in another type, the weights are copied from the checkpoint again.
     """
     bfloat16 = require("torch").bfloat16
     rounded_names: set[str] = set()
@@ -531,17 +536,17 @@ def _require_version(folder: Path) -> None:
 
 
 _FLASH, _PACKED = "flash_attention_2", "packed_sdpa"
-_CHECK = "_check_and_enable_flash_attn_2"  # a method of transformers' models, up to 4.5
+_CHECK = "_check_and_enable_flash_attn_2"  # a method of transformers' models up to 4.5
 
 
 @contextlib.contextmanager
 def built_without_flash_attention() -> Iterator[None]:
-    """Allow models that require flash-attention, such as N1.6's backbone, to be built without it
-    in this context.
+    """Within the context, allow models that require flash-attention, such as N1.6's backbone, to be
+    built without it.
     """
     base: Any = require("transformers").PreTrainedModel
     check = vars(base).get(_CHECK)
-    if check is None:  # N1.7's transformers, which falls back to another attention
+    if check is None:  # transformers of N1.7, which falls back to another attention
         yield
         return
 
@@ -591,11 +596,12 @@ def packed_attention(
         seq_len_list: The number of tokens of each sequence.
 
     Returns:
-        (1, tokens, heads, D), and None in place of the weights.
+        (1, tokens, heads, D), and None instead of the attention weights.
     """
     attention = require("torch.nn.functional").scaled_dot_product_attention
     lengths = list(seq_len_list)
-    if len(set(lengths)) == 1:  # equal lengths: one call, with a row for each sequence
+    # The lengths are equal, so one call with a row for each sequence is sufficient.
+    if len(set(lengths)) == 1:
         rows = []
         for tensor in (query, key, value):
             rows.append(tensor[0].unflatten(1, (-1, lengths[0])).transpose(0, 1))
@@ -609,24 +615,24 @@ def packed_attention(
     return require("torch").cat(attended_sequences, dim=2).transpose(1, 2), None
 
 
-# Masks of tokens (B, S): arguments of N1.6's usual transformer and of N1.7's.
+# The arguments with token masks, (B, S), of the default transformers of N1.6 and N1.7.
 _MASKS = ("image_mask", "backbone_attention_mask")
 
 
 def compile_with(transformer: Any, spare: int, compilation: Compilation) -> None:
     """Compile the transformer that a GR00T network calls in each step of the flow.
 
-    If it masks padding, prompts are padded to one shape: the length in the first call, which is
-    the warm-up, and `spare` tokens more.
+    If the transformer masks padding, all prompts are padded to the same length: the length in the
+    first call, which is the warm-up, plus `spare` tokens.
 
     Args:
         transformer: The transformer, whose `forward` is replaced.
-        spare: How many tokens a prompt may have beyond those of the warm-up.
+        spare: The number of tokens that a prompt may have in addition to the number in the warm-up.
         compilation: The compilation of the policy.
     """
     functional = require("torch.nn.functional")
     forward = transformer.forward
-    padded_length = 0  # tokens; 0 before the first call
+    padded_length = 0  # padded length of prompts in tokens; 0 before the first call
 
     def denoise(hidden: Any, times: Any, context: Any, *masks: Any) -> Any:
         masks_by_name = dict(zip(_MASKS, masks, strict=False))
@@ -637,8 +643,9 @@ def compile_with(transformer: Any, spare: int, compilation: Compilation) -> None
     core = compilation.core("denoise", denoise)
 
     def call(hidden_states: Any, encoder_hidden_states: Any, timestep: Any, **options: Any) -> Any:
-        """Return the core's result. It does not use the cache of keys and values, which is for
-        this call alone.
+        """Return the core's result.
+
+        It does not use the cache of keys and values, which is only used within one call.
         """
         nonlocal padded_length
         if not compilation.mode:
@@ -656,15 +663,16 @@ def compile_with(transformer: Any, spare: int, compilation: Compilation) -> None
     transformer.forward = call
 
 
-# LIBERO's names -> ours; for other embodiments, our names are the checkpoint's.
+# LIBERO's camera name -> our camera. For other embodiments, our names are the names in the
+# checkpoint.
 USUAL_CAMERAS = {"image": "front", "wrist_image": "wrist"}
-# The part of our state for a group `gripper` with several numbers, as in LIBERO.
+# The part of the robot's state for a group `gripper` with several numbers, as in LIBERO.
 GRIPPER_QPOS = "gripper_qpos"
 
 
 @dataclass(frozen=True)
 class Gr00tFrame:
-    """An observation by the embodiment's names, with the model's inputs if they need no other
+    """An observation under the embodiment's names, with the model's inputs if these need no other
     observation.
     """
 
@@ -718,8 +726,8 @@ class Gr00t(ModelPolicy):
         return network
 
     def perceive(self, obs: Obs) -> Gr00tFrame:
-        """Return the images and the state by the embodiment's names, and, without a history, the
-        model's inputs.
+        """Return the images and the state under the embodiment's names, and the model's inputs if
+        there is no history.
         """
         network: Gr00tNetwork = self.loaded()
         robot = network.embodiment
@@ -763,7 +771,9 @@ class Gr00t(ModelPolicy):
         return row.rng, network.read(images, states, row.instruction)
 
     def _state_widths(self, robot: Embodiment) -> dict[str, int | None]:
-        """Return the parts of our state that form the model's, with their widths if known."""
+        """Return the parts of the robot's state that form the model's state, with their widths
+        if known.
+        """
         if self.config.state is not None:
             return dict.fromkeys(self.config.state)
 

@@ -1,4 +1,4 @@
-"""Keys and values of a transformers cache as one tensor, which a compiled core can accept and
+"""Conversion of a transformers key-value cache to one tensor, which a compiled core can accept and
 return.
 """
 
@@ -15,9 +15,9 @@ def layers_of(cache: Any) -> list[tuple[Any, Any]]:
         cache: The cache.
 
     Returns:
-        Keys and values of each layer, (B, heads, L, E) each.
+        The keys and values of each layer, (B, heads, L, E) each.
     """
-    if hasattr(cache, "layers"):  # newer versions
+    if hasattr(cache, "layers"):  # in newer versions
         return [(layer.keys, layer.values) for layer in cache.layers]
     return [cache[number] for number in range(len(cache))]
 
@@ -26,7 +26,7 @@ def stack_of(layers: Sequence[tuple[Any, Any]]) -> Any:
     """Stack the keys and values of all layers.
 
     Args:
-        layers: Keys and values of each layer, (B, heads, L, E) each.
+        layers: The keys and values of each layer, (B, heads, L, E) each.
 
     Returns:
         One tensor, (B, layers, 2, heads, L, E).

@@ -1,7 +1,7 @@
-"""Python code of models that is not part of this package: from a checkout of the authors'
-repository, in a checkpoint, or in a hub repository that a checkpoint names.
+"""Functions for Python code of models that is not part of this package.
 
-The code of a checkpoint runs with all rights of this process.
+Such code is in a checkout of the authors' repository, in a checkpoint, or in a hub repository that
+a checkpoint names. The code of a checkpoint runs with all rights of this process.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ def use_source(
     Args:
         package: The name of the package.
         variable: The environment variable that names a checkout.
-        source_dir: A checkout to use in place of the variable's.
-        within: The folders of the checkout to import from; the first one contains `package`.
+        source_dir: A checkout that is used instead of the one in the variable.
+        within: The folders of the checkout from which modules are imported. The first folder
+            contains `package`.
 
     Raises:
         ConfigError: The package is neither in the checkout nor installed.
@@ -58,16 +59,16 @@ def use_source(
 
 @contextlib.contextmanager
 def remote_code(*, allowed: bool, source: Path | None = None) -> Iterator[None]:
-    """Prevent transformers from importing code of a checkpoint or of a hub repository in this
-    context, unless it is allowed.
+    """Within the context, prevent transformers from importing code of a checkpoint or of a hub
+    repository, unless such code is allowed.
 
-    This includes code that a library requests: some pass `trust_remote_code=True` with a name that
-    they read from the checkpoint.
+    This includes code that a library requests: some libraries pass `trust_remote_code=True` with a
+    name that they read from the checkpoint.
 
     Args:
         allowed: Whether all code may be imported.
-        source: The folder of a family's own code, which may be imported: some families have
-            transformers import a part of it.
+        source: The folder of a family's own code, which may be imported. Some families let
+            transformers import a part of their code.
 
     Raises:
         ConfigError: A model in this context needs code that may not be imported.
@@ -76,12 +77,12 @@ def remote_code(*, allowed: bool, source: Path | None = None) -> Iterator[None]:
         yield
         return
     dynamic: Any = require("transformers.dynamic_module_utils")
-    # All imports of such code pass through these three functions: the first finds it and calls the
-    # second, which copies it to the cache; the third executes it.
+    # All imports of such code call these three functions. The first finds the code and calls the
+    # second, which copies the code to the cache. The third executes the code.
     names = ("get_cached_module_file", "create_dynamic_module", "get_class_in_module")
     originals = [getattr(dynamic, name) for name in names]
     find, create, execute = originals
-    own_copies: set[str] = set()  # copies of files of `source`
+    own_copies: set[str] = set()  # paths of the copies of files of `source`
     finding_own = False  # whether `find` is running for a file of `source`
 
     def reject(name: Any) -> NoReturn:

@@ -1,5 +1,6 @@
-"""Octo, with windows of real frames, tasks in words or as images, and noise that each session
-draws itself.
+"""The policy Octo.
+
+Each session has its own window of frames, its own task, as text or as an image, and its own noise.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from vlagents_ray_models.model_code import CURE, remote_code, use_source
 
 
 class OctoConfig(ModelConfig):
-    """Settings of Octo, in addition to those of all models."""
+    """Settings of Octo, in addition to the settings of all models."""
 
     checkpoint: str = Field(
         min_length=1,
@@ -80,7 +81,7 @@ class OctoConfig(ModelConfig):
     )
 
 
-PRIMARY = "image_primary"  # the camera of goal images, which training crops
+PRIMARY = "image_primary"  # camera of goal images, which training crops
 USUAL_CAMERAS = {PRIMARY: "front", "image_wrist": "wrist"}
 
 
@@ -125,7 +126,7 @@ class Octo(ModelPolicy):
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         config = self.config
         network = OctoNetwork.load(config)
-        self._cameras(network)  # raises unless the configured cameras fit
+        self._cameras(network)  # raises an error unless the configured cameras fit
         needed = ("mean", "std") if config.normalization == "normal" else ("mean", "p01", "p99")
         statistics = network.statistics(config.dataset, "action")
         absent = [name for name in needed if name not in statistics]
@@ -150,12 +151,14 @@ class Octo(ModelPolicy):
                 f"state: expected {needed_state}, got {config.state}; set it as in training"
             )
         if network.proprio_dim is not None:
-            network.statistics(config.dataset, PROPRIO)  # raises if there are none
+            # Raises an error if there are no statistics.
+            network.statistics(config.dataset, PROPRIO)
         return network
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode. Its task is `obs.info["goal_image"]` if there is one, else the
-        instruction.
+        """Begin an episode.
+
+        Its task is `obs.info["goal_image"]` if there is one, otherwise the instruction.
         """
         goal = self._goal(obs, instruction)
         info = super().reset(obs, instruction, **kwargs)
@@ -164,7 +167,7 @@ class Octo(ModelPolicy):
         return info
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
-        """Return the images (H, W, 3) uint8 and the normalised state (D,) float32 by Octo's
+        """Return the images, (H, W, 3) uint8, and the normalised state, (D,) float32, under Octo's
         names.
         """
         network: OctoNetwork = self.model
@@ -179,8 +182,8 @@ class Octo(ModelPolicy):
         return inputs
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """Compute the chunks: one pass of the transformer for all windows, and one of the action
-        head for all rows.
+        """Compute the chunks, in one pass of the transformer for all windows and one pass of the
+        action head for all rows.
         """
         network: OctoNetwork = self.model
         firsts, owners = self.observations_of(rows)
@@ -194,10 +197,9 @@ class Octo(ModelPolicy):
         return [Prediction(real_actions(chunk, statistics, normalization)) for chunk in chunks]
 
     def _observations(self, rows: Sequence[Row]) -> dict[str, np.ndarray]:
-        """Return windows (B, W, …) of observations by name, with "timestep_pad_mask" (B, W).
+        """Return windows of observations by name, (B, W, …), with "timestep_pad_mask" (B, W).
 
-        A window before which there are too few frames begins with copies of its first frame, which
-        are masked.
+        If there are too few frames, a window begins with masked copies of its first frame.
         """
         length = self.history
         histories = [row.history(length) for row in rows]
@@ -213,8 +215,8 @@ class Octo(ModelPolicy):
         return observations
 
     def _tasks(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Return the tasks of a batch: words with blank goal images, or goal images with blank
-        words, and their masks.
+        """Return the tasks of a batch and their masks: texts with blank goal images, or goal images
+        with blank texts.
         """
         goals = [row.memory.get(GOAL_IMAGE) for row in rows]
         texts = []
@@ -233,7 +235,8 @@ class Octo(ModelPolicy):
         """Return the goal image at the model's size; None if the instruction is the task.
 
         Raises:
-            InvalidObservation: There is no task of the configured kind, or the image is none.
+            InvalidObservation: There is no task of the configured kind, or the goal is not a valid
+                image.
         """
         goal = obs.info.get(GOAL_IMAGE)
         task = self.config.goal
@@ -270,7 +273,8 @@ class Octo(ModelPolicy):
         chosen = self.config.cameras
         names = list(network.cameras)
         if chosen and set(chosen) <= set(names):
-            return chosen  # Octo was trained with missing cameras, whose tokens it omits
+            # Octo was also trained without some cameras, and omits the tokens of missing ones.
+            return chosen
         usual = {name: ours for name, ours in USUAL_CAMERAS.items() if name in names}
         return choose_cameras(chosen, usual, names)
 
@@ -279,7 +283,8 @@ def _action_spec(dim: int, dataset: str | None) -> ActionSpec:
     """Describe the actions of a pretraining dataset, which have a standard form.
 
     The form is that of octo/data/oxe: the change of the end effector's position and of its roll,
-    pitch and yaw, then the gripper, 1 = open. Fine-tuned checkpoints do not declare theirs.
+    pitch and yaw, then the gripper, 1 = open. Fine-tuned checkpoints do not declare the form of
+    their actions.
     """
     if dataset is None or dim != 7:
         return ActionSpec(dim=dim)
@@ -309,7 +314,8 @@ def octo_model_class(source_dir: str | None) -> Any:
     """Import `octo.model.octo_model.OctoModel`.
 
     Args:
-        source_dir: A checkout of Octo; None: the one that OCTO_SRC names, or the installed one.
+        source_dir: A checkout of Octo. With None, the checkout that OCTO_SRC names or the installed
+            Octo is used.
 
     Raises:
         ConfigError: Octo is not found.
@@ -320,7 +326,7 @@ def octo_model_class(source_dir: str | None) -> Any:
         stub: Any = types.ModuleType("dlimp")
         stub.DLataset = object
         sys.modules["dlimp"] = stub
-    # TensorFlow only resizes images, and JAX needs the memory of the GPU.
+    # TensorFlow only resizes images, and must leave the memory of the GPU to JAX.
     require("tensorflow").config.set_visible_devices([], "GPU")
     return require("octo.model.octo_model").OctoModel
 
@@ -334,7 +340,7 @@ class OctoNetwork:
         self.model = model
         self.params = jax.device_put(model.params, device)
         self.head = model.module.heads["action"]
-        # Observations: as many as in training, and as many as the model has positions for.
+        # Numbers of observations: in training, and at most, according to the model's positions.
         self.window: int = model.example_batch["observation"]["timestep_pad_mask"].shape[1]
         self.longest: int = model.module.octo_transformer.max_horizon
 
@@ -347,7 +353,8 @@ class OctoNetwork:
         """Read a checkpoint.
 
         Raises:
-            ConfigError: It is incomplete, or names code that is not Octo's and is not trusted.
+            ConfigError: The checkpoint is incomplete, or names code outside of Octo that is not
+                trusted.
         """
         octo_model = octo_model_class(config.source_dir)
         folder, step = _folder_and_step(config.checkpoint, config.checkpoint_step)
@@ -382,7 +389,7 @@ class OctoNetwork:
 
     @cached_property
     def cameras(self) -> dict[str, tuple[int, int]]:
-        """The height and width of each image that a tokenizer reads, by Octo's name."""
+        """The height and width of each image that a tokenizer reads, under Octo's name."""
         shapes = self._shapes_read_by("ImageTokenizer", "obs_stack_keys", ("image_.*",))
         cameras: dict[str, tuple[int, int]] = {}
         for name, shape in shapes.items():
@@ -400,7 +407,7 @@ class OctoNetwork:
         """Return statistics of the checkpoint.
 
         Args:
-            dataset: The dataset; None: the checkpoint's only one.
+            dataset: The dataset; None selects the checkpoint's only dataset.
             name: "action" or "proprio".
 
         Returns:
@@ -437,7 +444,7 @@ class OctoNetwork:
             tasks: Their tasks, as `create_tasks` of the model returns them.
 
         Returns:
-            Tokens (P, W, N, E) and their mask (P, W, N), on the device.
+            The tokens (P, W, N, E) and their mask (P, W, N), on the device.
         """
         encoded: tuple[Any, Any] = self._encode(self.params, observations, tasks)
         return encoded
@@ -451,7 +458,7 @@ class OctoNetwork:
             encoded: The result of `encode` for P observations.
             owners: (B,) int, the observation of each row.
             keys: (B, 2) uint32, the random key of each row.
-            dim: How many numbers an action has.
+            dim: The number of values of an action.
 
         Returns:
             The actions, (B, H, dim).
@@ -493,8 +500,8 @@ class OctoNetwork:
 
         Args:
             tokenizer: The name of the class.
-            setting: Its setting for the patterns of the arrays' names.
-            usual: The patterns of a tokenizer without that setting.
+            setting: The tokenizer's setting with the patterns of the arrays' names.
+            usual: The patterns for tokenizers without the setting.
         """
         patterns: list[str] = []
         for spec in self.model.config["model"]["observation_tokenizers"].values():
@@ -544,7 +551,9 @@ def real_actions(
 
 
 def _folder_and_step(checkpoint: str, step: int | None) -> tuple[Path, int]:
-    """Return the folder with the configuration and the step within it, by default the newest."""
+    """Return the folder with the configuration, and the step in that folder, by default the
+    newest step.
+    """
     folder = find_checkpoint(checkpoint.removeprefix("hf://"), step)
     if folder.name.isdigit() and not (folder / _FILES[0]).exists():
         folder, step = folder.parent, int(folder.name)
@@ -560,18 +569,18 @@ def _folder_and_step(checkpoint: str, step: int | None) -> tuple[Path, int]:
         )
     if step is None:
         step = max(steps)
-    # These files alone identify the checkpoint: training adds further steps to the folder.
+    # Only these files identify the checkpoint, since training adds further steps to the folder.
     for name in (*_FILES, str(step)):
         find_checkpoint(str(folder / name))
     return folder, step
 
 
-_COMPONENTS = "octo.model.components."  # tokenizers, encoders, action heads
+_COMPONENTS = "octo.model.components."  # package of tokenizers, encoders and action heads
 _TEXT_PROCESSING = "octo.data.utils.text_processing"
 
 
 def require_own_classes(file: Path) -> None:
-    """Raise `ConfigError` unless a config.json names only classes of Octo's components and text
+    """Raise `ConfigError` unless all classes in a config.json are Octo's components and text
     processors.
 
     Other classes are not imported, since Octo accepts any callable of any module, including
@@ -589,7 +598,8 @@ def require_own_classes(file: Path) -> None:
         ) from error
 
     classes = [(spec["module"], spec["name"]) for spec in _specs(sections)]
-    for is_own in (_is_own_name, _is_own_class):  # check all names before importing anything
+    # All names are checked before anything is imported.
+    for is_own in (_is_own_name, _is_own_class):
         for module, name in classes:
             if not is_own(module, name):
                 raise ConfigError(
@@ -600,7 +610,7 @@ def require_own_classes(file: Path) -> None:
 
 
 def _specs(value: object) -> Iterator[Mapping[str, Any]]:
-    """Yield each specification of a class at any depth of a configuration."""
+    """Yield each class specification in a configuration, at any depth."""
     if isinstance(value, Mapping):
         if "module" in value and "name" in value:
             yield value
@@ -629,7 +639,8 @@ def _is_own_class(module: str, name: str) -> bool:
     return inspect.isclass(value) and value.__module__.startswith("octo.")
 
 
-# Share of each side that is shown; its square is the average area of training's random crops.
+# The share of each side that is shown. Its square is the average area of the random crops in
+# training.
 _CROP_SIDE = np.sqrt(np.float32(0.9))
 
 
@@ -646,7 +657,7 @@ def resized(image: np.ndarray, height: int, width: int, *, crop: bool) -> np.nda
         A copy, (height, width, 3) uint8.
     """
     if not crop and image.shape[:2] == (height, width):
-        return image.copy()  # the filter would change nothing
+        return image.copy()  # The filter would change nothing.
 
     tf = require("tensorflow")
     scaled = tf.image.resize(image, (height, width), method="lanczos3", antialias=True)

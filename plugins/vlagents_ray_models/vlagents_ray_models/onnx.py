@@ -1,7 +1,7 @@
-"""Exported policies of any kind, ONNX files and TorchScript archives.
+"""Exported policies of any kind, as ONNX files or TorchScript archives.
 
-A deployment file declares the source of each input and the meaning of the outputs. Each session
-keeps its own recurrent state, and all sessions share a batch.
+A deployment file declares the source of each input and the meaning of the outputs. Each session has
+its own recurrent state, and all sessions share a batch.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ SOURCES = ("state", "constant", "step", "noise", "instruction")  # fields of `In
 
 
 class Scaling(BaseModel, extra="forbid"):
-    """The conversion of the robot's numbers to the model's, (x - mean) / std, and of the
-    action's numbers back.
+    """The conversion of the robot's numbers to the model's numbers, (x - mean) / std, and the
+    inverse conversion for actions.
     """
 
     mean: Numbers | dict[str, Numbers] = Field(
@@ -61,7 +61,7 @@ class Scaling(BaseModel, extra="forbid"):
     clip: tuple[float, float] | None = Field(
         default=None, description="limits of the model's numbers"
     )
-    # Mean and std by part of the state, float32, once they are used.
+    # Cached mean and std of each part of the state, float32.
     _arrays: dict[str, tuple[Any, Any]] = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
@@ -77,7 +77,7 @@ class Scaling(BaseModel, extra="forbid"):
 
     @property
     def parts(self) -> set[str]:
-        """The parts of the state that have statistics of their own."""
+        """The parts of the state that have separate statistics."""
         parts: set[str] = set()
         for statistic in (self.mean, self.std, self.min, self.max):
             if isinstance(statistic, dict):
@@ -89,7 +89,7 @@ class Scaling(BaseModel, extra="forbid"):
 
         Args:
             values: The robot's numbers, (..., D) float32.
-            part: The part of the state that they are.
+            part: The part of the state to which the values belong.
 
         Returns:
             The model's numbers, (..., D).
@@ -100,7 +100,7 @@ class Scaling(BaseModel, extra="forbid"):
         return values if self.clip is None else values.clip(*self.clip)
 
     def unnormalized(self, values: np.ndarray) -> np.ndarray:
-        """Convert the model's numbers, (..., D) float32, to the robot's."""
+        """Convert the model's numbers, (..., D) float32, to the robot's numbers."""
         mean, std = self._mean_and_std()
         restored: np.ndarray = values * std + mean
         return restored
@@ -125,8 +125,8 @@ def _statistic(setting: Any, part: str, default: float) -> Any:
 
 
 class Input(Scaling):
-    """Settings of one input of the file: its source, if it is neither a camera nor the whole state,
-    and its conversion.
+    """Settings of one input of the file: its conversion, and its source if the source is neither a
+    camera nor the whole state.
     """
 
     state: list[str] | None = Field(
@@ -171,8 +171,8 @@ class Input(Scaling):
 
 
 class Action(Scaling):
-    """The output that is the action: offset (`mean`) plus scale (`std`) times the model's
-    numbers.
+    """The output that contains the action, and its conversion: the action is offset (`mean`) plus
+    scale (`std`) times the output.
     """
 
     output: str | None = Field(
@@ -182,7 +182,7 @@ class Action(Scaling):
 
 
 class OnnxConfig(ModelConfig):
-    """Settings of an exported policy, in addition to those of all models."""
+    """Settings of an exported policy, in addition to the settings of all models."""
 
     checkpoint: str = Field(
         min_length=1,
@@ -238,7 +238,7 @@ class OnnxConfig(ModelConfig):
 
 TOKENIZER = "tokenizer.json"
 _TORCHSCRIPT = (".pt", ".pth", ".jit")
-# ONNX's names of types -> numpy's, where they differ.
+# ONNX's name of a type -> numpy's name, where they differ.
 _TYPES = {"float": "float32", "double": "float64", "string": "object"}
 
 Arrays = Mapping[str, np.ndarray]
@@ -248,12 +248,12 @@ Arrays = Mapping[str, np.ndarray]
 class Tensor:
     """An input of a graph."""
 
-    shape: tuple[int, ...]  # -1 is the batch
+    shape: tuple[int, ...]  # lengths of the dimensions; -1 is the batch
     dtype: np.dtype[Any]
 
     @cached_property
     def batch_axis(self) -> int | None:
-        """The dimension of the batch; None if the input has one row."""
+        """The index of the batch dimension; None if the input always has one row."""
         return self.shape.index(-1) if -1 in self.shape else None
 
     @cached_property
@@ -263,7 +263,7 @@ class Tensor:
 
     @cached_property
     def size(self) -> int:
-        """How many numbers a row has."""
+        """The number of values in a row."""
         return prod(self.row_shape)
 
     def zeros(self) -> np.ndarray:
@@ -278,7 +278,7 @@ class Tensor:
 
 
 class OnnxGraph:
-    """The graph of an ONNX file, which ONNX Runtime computes."""
+    """The graph of an ONNX file, executed with ONNX Runtime."""
 
     def __init__(self, path: Path, config: OnnxConfig) -> None:
         runtime = require("onnxruntime")
@@ -286,7 +286,8 @@ class OnnxGraph:
         options = runtime.SessionOptions()
         options.intra_op_num_threads = config.threads
         options.use_deterministic_compute = True
-        # Errors only, as there is a warning for each unused weight that an exporter left.
+        # Only errors are logged, since there would be a warning for each unused weight that an
+        # exporter left in the file.
         options.log_severity_level = 3
         try:
             self._session = runtime.InferenceSession(
@@ -296,7 +297,7 @@ class OnnxGraph:
             raise ConfigError(
                 f"checkpoint {path}: ONNX Runtime cannot read it: {_first_line(error)}"
             ) from error
-        # ONNX Runtime only warns of this, and would compute on the CPU.
+        # ONNX Runtime only logs a warning in this case, and would compute on the CPU.
         if provider not in self._session.get_providers():
             raise ConfigError(
                 f"device {config.device!r}: {provider} did not start, as the log says; install the "
@@ -310,7 +311,7 @@ class OnnxGraph:
             name = graph_input.name
             onnx_type = graph_input.type.removeprefix("tensor(").removesuffix(")")
             dtype = np.dtype(_TYPES.get(onnx_type, onnx_type))
-            # An open length has a name, or none.
+            # An open length is a name or None.
             lengths = [length if isinstance(length, int) else -1 for length in graph_input.shape]
             self.inputs[name] = Tensor(_shape(name, lengths, config), dtype)
 
@@ -320,7 +321,7 @@ class OnnxGraph:
 
 
 class TorchScript:
-    """An archive of `torch.jit.save`, whose inputs are the arguments of `forward`, float32."""
+    """An archive of `torch.jit.save`. Its inputs are the arguments of `forward`, float32."""
 
     def __init__(self, path: Path, config: OnnxConfig) -> None:
         torch = require("torch")
@@ -328,7 +329,7 @@ class TorchScript:
         self.outputs = config.outputs
         try:
             self._module = torch.jit.load(str(path), map_location=self._device).eval()
-            arguments = self._module.forward.schema.arguments[1:]  # without `self`
+            arguments = self._module.forward.schema.arguments[1:]  # all arguments except `self`
         except (RuntimeError, AttributeError, ValueError) as error:
             raise ConfigError(
                 f"checkpoint {path}: torch.jit.load cannot read it: {_first_line(error)}"
@@ -366,7 +367,8 @@ def read_graph(config: OnnxConfig) -> tuple[OnnxGraph | TorchScript, Path]:
         The graph, and its file.
 
     Raises:
-        ConfigError: The checkpoint is not one such file, is not trusted, or cannot be read.
+        ConfigError: The checkpoint is not a single file of a supported type, is not trusted, or
+            cannot be read.
     """
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
     files = [path] if path.is_file() else sorted(path.rglob("*"))
@@ -379,8 +381,8 @@ def read_graph(config: OnnxConfig) -> tuple[OnnxGraph | TorchScript, Path]:
         )
     [file] = graph_files
 
-    # The digest of a single file also covers the files that belong to it: the weights of a large
-    # graph and the tokenizer.
+    # The digest of the checkpoint must also cover the files that belong to a single graph file: the
+    # weights of a large graph and the tokenizer.
     if path == file:
         for pattern in (f"{file.name}[._]*", TOKENIZER):
             for related in file.parent.glob(pattern):
@@ -405,8 +407,9 @@ def _shape(name: str, lengths: Sequence[int] | None, config: OnnxConfig) -> tupl
 
     Args:
         name: The name of the input.
-        lengths: Its lengths in the file, where -1 is an open one; None if the file has none.
-        config: The settings, whose shape replaces the file's.
+        lengths: The lengths in the file, where -1 is an open length; None if the file specifies
+            none.
+        config: The settings, whose shape has priority over the file's shape.
 
     Raises:
         ConfigError: More than one length is open, or all are.
@@ -422,24 +425,25 @@ def _shape(name: str, lengths: Sequence[int] | None, config: OnnxConfig) -> tupl
     return tuple(shape)
 
 
-# The part of the state that is the model's last action, in the model's numbers.
+# The part of the state that contains the model's last action, before offset and scale.
 PREVIOUS = "previous_output"
-# Largest difference of outputs computed alone and in a batch, relative to the largest output: more
-# than a different order of summation changes.
+# The largest accepted difference between outputs computed alone and in a batch, relative to the
+# largest output. It exceeds the effect of another order of summation.
 _TOLERANCE = 1e-3
 
 
 class Network:
-    """A graph with the meaning of its inputs and outputs. All sessions share it, and none changes
-    it.
+    """A graph with the meaning of its inputs and outputs.
+
+    All sessions share it, and no session changes it.
     """
 
     def __init__(self, graph: OnnxGraph | TorchScript, path: Path, config: OnnxConfig) -> None:
-        """Map the inputs and outputs, and try the graph on random rows.
+        """Map the inputs and outputs, and test the graph with random rows.
 
         Args:
             graph: The graph.
-            path: Its file.
+            path: The file of the graph.
             config: The settings of the policy.
 
         Raises:
@@ -449,7 +453,7 @@ class Network:
         self.config = config
         self.cameras = config.cameras or {}
         self.options = {name: config.inputs.get(name, Input()) for name in graph.inputs}
-        self.vectors: dict[str, list[str]] = {}  # each input that is a vector -> its parts
+        self.vectors: dict[str, list[str]] = {}  # name of each vector input -> its parts
         for name, option in self.options.items():
             if option.state is not None:
                 self.vectors[name] = option.state
@@ -475,29 +479,31 @@ class Network:
                     f"shape, {input_shape}, got {output_shape}; name the output that is the "
                     "input's next value"
                 )
-        # PREVIOUS before the first action, (H * D,).
+        # The value of PREVIOUS before the first action, (H * D,).
         self.zero_output = np.zeros(example[self.action].size, np.float32)
         self._require_fitting(example)
         self.contract = self._contract(*self.chunk(example).shape)
 
     @cached_property
     def has_memory(self) -> bool:
-        """Whether a result depends on earlier ones of its session, except through `history`."""
+        """Whether a result depends on earlier results of the session, other than through
+        `history`.
+        """
         counts_steps = any(option.step is not None for option in self.options.values())
         reads_previous = any(PREVIOUS in parts for parts in self.vectors.values())
         return counts_steps or reads_previous or bool(self.config.recurrent)
 
     @cached_property
     def action(self) -> str:
-        """The output that is the action."""
+        """The name of the output that contains the action."""
         if self.config.action.output:
             return self.config.action.output
         other_outputs = {*self.config.recurrent.values(), *self.config.info}
         return next(name for name in self.graph.outputs if name not in other_outputs)
 
     def chunk(self, outputs: Arrays) -> np.ndarray:
-        """Return the action in the outputs for one observation as a new array (H, D) float32, not
-        yet unnormalized.
+        """Return the action in the outputs for one observation as a new array, (H, D) float32,
+        before it is unnormalized.
         """
         output = outputs[self.action]
         dim = output.shape[-1] if output.ndim else 1
@@ -506,8 +512,8 @@ class Network:
         return chunk if clip is None else chunk.clip(*clip)
 
     def observed_length(self, name: str) -> int:
-        """Return how many numbers of a vector come from one observation: all but the previous
-        output.
+        """Return how many numbers of a vector come from one observation, i.e. all except the
+        previous output.
         """
         length = self.graph.inputs[name].size // self.options[name].history
         if PREVIOUS in self.vectors[name]:
@@ -524,7 +530,7 @@ class Network:
         """Return the inputs that contain the instruction, with a batch of one.
 
         Raises:
-            InvalidObservation: It has more tokens than an input.
+            InvalidObservation: The instruction has more tokens than an input.
         """
         encoded: dict[str, np.ndarray] = {}
         for name, option in self.options.items():
@@ -548,10 +554,12 @@ class Network:
         return encoded
 
     def run(self, rows: Sequence[Arrays]) -> list[dict[str, np.ndarray]]:
-        """Return the used outputs of each row, all from one pass if the file has an open batch.
+        """Return the used outputs of each row.
+
+        If the file has an open batch dimension, all rows are computed in one pass.
 
         Args:
-            rows: The inputs of each row except the constants, with a batch of one.
+            rows: The inputs of each row without the constants, with a batch of one.
         """
         if len(rows) > 1 and self.batched:
             return self._run_batch(rows)
@@ -578,12 +586,12 @@ class Network:
         return row_outputs
 
     def _try_rows(self) -> dict[str, np.ndarray]:
-        """Run random rows, decide whether rows may share a pass, and return the outputs of one.
+        """Run random rows, decide whether rows may share a pass, and return the outputs of one row.
 
         Raises:
             ConfigError: The graph fails, or returns different outputs for the same inputs.
         """
-        # The outputs that are used, with the dimension of their batch.
+        # The used outputs, with the index of their batch dimension.
         self._output_axes = dict.fromkeys((self.action, *self.config.info), 0)
         for name, next_value in self.config.recurrent.items():
             self._output_axes[next_value] = self.graph.inputs[name].batch_axis or 0
@@ -596,7 +604,7 @@ class Network:
             *alone, again = self.run([*rows, rows[0]])
         except ConfigError:
             raise
-        except Exception as error:  # error of the runtimes' many classes
+        except Exception as error:  # the runtimes raise errors of many classes
             shapes = ", ".join(
                 f"{name} {tensor.row_shape} {tensor.dtype}" for name, tensor in self.inputs.items()
             )
@@ -605,31 +613,35 @@ class Network:
         if not _close(alone[0], again):
             raise ConfigError(
                 "the file computes another output from the same inputs: it draws noise, or keeps a "
-                "state, in which sessions would mix; export that as an input (`noise: true`, or "
-                "`recurrent`)"
+                "state, in which sessions would mix; export the noise or the state as an input "
+                "(`noise: true`, or `recurrent`)"
             )
         self.batched = self._can_batch(rows, alone)
         return alone[0]
 
     def _can_batch(self, rows: Sequence[Arrays], alone: Sequence[Mapping[str, np.ndarray]]) -> bool:
-        """Return whether rows have the same outputs in one pass as alone; if not, log why."""
+        """Return whether rows have the same outputs in one pass as alone.
+
+        If they differ, log the reason.
+        """
         if any(tensor.batch_axis is None for tensor in self.inputs.values()):
             return False
 
         try:
             if all(map(_close, alone, self._run_batch(rows))):
                 return True
-            # This happens if the open length is that of a sequence.
-            reason = "rows change each other in it"
-        except Exception as error:  # noqa: BLE001 - an open length may be another than the batch's
+            # This happens if the open dimension is the length of a sequence.
+            reason = "rows of a batch change each other's outputs"
+        except Exception as error:  # noqa: BLE001 - the open dimension may not be the batch
             reason = _first_line(error)
         log.warning(
-            "rows are computed one by one, as the file's open dimension is no batch: %s", reason
+            "rows are computed one by one, as the file's open dimension is not the batch: %s",
+            reason,
         )
         return False
 
     def _require_mapped(self) -> None:
-        """Assign the parts in `state` to the one input without another source.
+        """Assign the parts in `state` to the only input without another source.
 
         Raises:
             ConfigError: An input has no source or several, the action is not determined, or a name
@@ -642,7 +654,7 @@ class Network:
                 with_source.append(name)
         named_inputs = [*self.cameras, *config.recurrent, *with_source]
         without_source = [name for name in inputs if name not in named_inputs]
-        unused_state: list[str] = []  # the parts in `state`, if no input is left for them
+        unused_state: list[str] = []  # the parts in `state`, if no input remains for them
         if config.state is not None:
             if not without_source:
                 unused_state = config.state
@@ -656,7 +668,7 @@ class Network:
         unknown = {*self.cameras, *config.inputs, *config.recurrent} - inputs.keys()
         unknown |= named_outputs - {*outputs}
 
-        action_candidates: list[str] = []  # if the action is not determined
+        action_candidates: list[str] = []  # candidates, if the action is not determined
         if not config.action.output:
             action_candidates = [name for name in outputs if name not in other_outputs]
             if len(action_candidates) == 1:
@@ -681,8 +693,8 @@ class Network:
             )
 
     def _require_used(self) -> None:
-        """Raise `ConfigError` for an option that its input does not use, and for statistics of a
-        part that it does not have.
+        """Raise `ConfigError` for options that an input does not use, and for statistics of parts
+        that the input does not have.
         """
         unused = {"action": self.config.action.parts}
         for name, option in self.config.inputs.items():
@@ -702,7 +714,7 @@ class Network:
         if name in self.cameras:
             usable |= {"history", "resize"}
             if self.graph.inputs[name].dtype == np.uint8:
-                return usable  # the model gets the pixels unchanged
+                return usable  # The model receives the pixels unchanged.
             usable |= {"range", *Scaling.model_fields}
         elif name in self.vectors:
             usable |= {"history", *Scaling.model_fields}
@@ -720,9 +732,9 @@ class Network:
 
     def _require_fitting(self, example: Arrays) -> None:
         """Raise `ConfigError` unless the inputs of cameras have the shape of images, and lists of
-        statistics are as long as what they scale.
+        statistics are as long as the vectors that they scale.
         """
-        # The setting, its conversion, and numbers of the shape that it converts.
+        # The setting, its conversion function, and example numbers of the converted shape.
         conversions: list[tuple[str, Any, Any]] = [
             ("action", self.config.action.unnormalized, self.chunk(example))
         ]
@@ -758,7 +770,7 @@ class Network:
                 )
 
     def _tokenizer(self, path: Path) -> Any:
-        """Read the tokenizer next to the graph's file; return None if no input needs it."""
+        """Read the tokenizer next to the graph's file. Return None if no input needs it."""
         if not {"tokens", "mask"} & {option.instruction for option in self.options.values()}:
             return None
 
@@ -775,7 +787,7 @@ class Network:
         return tokenizer
 
     def _contract(self, horizon: int, dim: int) -> Contract:
-        """Return the contract of the settings, with the shapes of the file."""
+        """Return the contract that follows from the settings and the shapes in the file."""
         config = self.config
         try:
             configured = Contract.from_json(config.contract)
@@ -807,7 +819,7 @@ class Network:
 
 
 def _close(outputs: Arrays, expected: Arrays) -> bool:
-    """Return whether all expected outputs are equal up to `_TOLERANCE`."""
+    """Return whether all outputs equal the expected ones up to `_TOLERANCE`."""
     for name, expected_values in expected.items():
         values = outputs[name]
         largest = np.abs(expected_values[np.isfinite(expected_values)]).max(initial=1)
@@ -818,7 +830,7 @@ def _close(outputs: Arrays, expected: Arrays) -> bool:
     return True
 
 
-_STEP, _RECURRENT = "step", "recurrent"  # keys in a session's memory, in addition to PREVIOUS
+_STEP, _RECURRENT = "step", "recurrent"  # keys of a session's memory, in addition to PREVIOUS
 
 
 @dataclass(slots=True)
@@ -862,7 +874,10 @@ class Onnx(ModelPolicy):
         return info
 
     def observe(self, obs: Obs) -> None:
-        """Add an observation, from which the model also computes its next memory."""
+        """Add an observation without requesting an action.
+
+        The model also computes its next memory from this observation.
+        """
         super().observe(obs)
         if self.model.has_memory:
             episode = self._current_episode()
@@ -889,7 +904,7 @@ class Onnx(ModelPolicy):
             frame.values[name] = option.normalized(state_vector(obs, parts, length))
             return
 
-        # This raises an error if the observation does not fit.
+        # This call raises an error if the observation does not fit.
         state_vector(obs, [part for part in parts if part != PREVIOUS], length)
         blocks: list[np.ndarray] = []
         for part in parts:
@@ -966,7 +981,7 @@ class Onnx(ModelPolicy):
             frame.gaps = {}
 
     def _pixels(self, name: str, image: np.ndarray) -> np.ndarray:
-        """Return an image (H, W, 3) uint8 as the model's input, without its batch."""
+        """Convert an image, (H, W, 3) uint8, to the model's input, without the batch dimension."""
         network: Network = self.model
         option, tensor = network.options[name], network.graph.inputs[name]
         height, width = network.image_size(name)

@@ -50,20 +50,21 @@ class RobotConvention:
     """The mapping of an `Obs` to the inputs of openpi's transforms for a robot."""
 
     cameras: Mapping[str, str]  # openpi's key -> our camera
-    state: Mapping[str, Mapping[str, int]]  # openpi's key -> parts of our state and their lengths
+    # openpi's key -> parts of the robot's state and their lengths.
+    state: Mapping[str, Mapping[str, int]]
     layout: Layout = "hwc"
     action: ActionSpec = field(default_factory=ActionSpec)
     optional: tuple[str, ...] = ()  # cameras that openpi masks if they are missing
 
     def read(self, obs: Obs) -> dict[str, Any]:
-        """Convert an observation to openpi's, without the prompt.
+        """Convert an observation to openpi's form, without the prompt.
 
         Args:
             obs: The observation.
 
         Returns:
             Copies of the images, uint8 in the convention's layout, and the state's vectors,
-            float32, under openpi's keys. A dot in a key leads to a nested dict.
+            float32, under openpi's keys. A dot in a key means a nested dict.
         """
         data: dict[str, Any] = {}
         for key, image in camera_images(obs, self.cameras).items():
@@ -74,7 +75,7 @@ class RobotConvention:
 
 
 def _put(data: dict[str, Any], key: str, value: np.ndarray) -> None:
-    """Store a value under a key, whose dots separate the keys of nested dicts."""
+    """Store a value under a key. Dots separate the keys of nested dicts."""
     *outer_keys, last_key = key.split(".")
     for outer_key in outer_keys:
         data = data.setdefault(outer_key, {})
@@ -93,9 +94,10 @@ _ALOHA = RobotConvention(
     optional=("images.cam_left_wrist", "images.cam_right_wrist"),
 )
 
-# As in openpi's examples/{libero,droid,aloha_real,aloha_sim}, by the class of openpi's observation
-# transform. In actions of LIBERO and DROID, 1 closes the gripper; in DROID's observations, 0 is
-# open. ALOHA's two grippers, numbers 6 and 13, are in [0, 1], where 1 is open, and stay unchanged.
+# Class of openpi's observation transform -> convention, as in openpi's
+# examples/{libero,droid,aloha_real,aloha_sim}. In actions of LIBERO and DROID, 1 closes the
+# gripper; in DROID's observations, 0 is open. ALOHA's two grippers, numbers 6 and 13, are in [0,
+# 1], where 1 is open, and stay unchanged.
 ROBOTS: Mapping[str, RobotConvention] = {
     "LiberoInputs": RobotConvention(
         {"observation/image": "front", "observation/wrist_image": "wrist"},
@@ -112,7 +114,7 @@ ROBOTS: Mapping[str, RobotConvention] = {
     ),
     "AlohaInputs": _ALOHA,
 }
-_QUANTILES = ("q01", "q99")  # the statistics with which a robot is compared to the training
+_QUANTILES = ("q01", "q99")  # statistics with which a robot's values are compared with the training
 
 
 def choose_robot(config: str, transform: str, settings: OpenPiConfig) -> RobotConvention:
@@ -137,7 +139,7 @@ def choose_robot(config: str, transform: str, settings: OpenPiConfig) -> RobotCo
             )
         usual = RobotConvention(cameras, {})
     if cameras is None and config == "pi0_aloha_sim":
-        cameras = {"images.cam_high": "front"}  # the simulation has one camera
+        cameras = {"images.cam_high": "front"}  # The simulation has only one camera.
 
     used_keys = []
     for key in usual.cameras:
@@ -158,13 +160,15 @@ class Transforms:
     `create_trained_policy`.
     """
 
-    inputs: Any  # converts a dict of unbatched arrays to the model's, as `outputs` and `forward` do
+    # Converts a dict of unbatched arrays to the model's inputs; `outputs` and `forward` also
+    # convert dicts.
+    inputs: Any
     outputs: Any
-    forward: Any  # the part of `inputs` for actions, before the model's own transforms
-    # Lowest and highest of the training's "state" and "actions", (D,), in the units of `forward`;
-    # empty if the checkpoint has none.
+    forward: Any  # part of `inputs` that converts actions, before the model's own transforms
+    # The lowest and highest values of "state" and "actions" in training, (D,), in the units of
+    # `forward`; empty if the checkpoint has none.
     bounds: Sequence[Mapping[str, np.ndarray]]
-    robot: str  # the class of its first observation transform, e.g. "LiberoInputs"
+    robot: str  # class of the first observation transform, e.g. "LiberoInputs"
     needs_prompt: bool  # False if the config has a prompt
 
     @classmethod
@@ -179,7 +183,7 @@ class Transforms:
             ConfigError: The checkpoint lacks statistics of the config's asset.
         """
         openpi = require("openpi.transforms")
-        # The statistics are the checkpoint's: openpi itself would first look online.
+        # Only the checkpoint's statistics are used. openpi itself would first search online.
         assets = dataclasses.replace(config.data.assets, assets_dir=str(folder / "assets"))
         data_factory = dataclasses.replace(config.data, assets=assets)
         data = data_factory.create(config.assets_dirs, config.model)
@@ -245,7 +249,7 @@ class Transforms:
     def plan(
         self, observation: dict[str, Any], instruction: str, actions: np.ndarray
     ) -> np.ndarray:
-        """Convert a robot's actions to the model's units.
+        """Convert planned actions of a robot to the model's units.
 
         Args:
             observation: The result of `RobotConvention.read`.
@@ -253,7 +257,8 @@ class Transforms:
             actions: The actions in the robot's units, (H, D).
 
         Returns:
-            The actions, (H, action_dim) float32, relative to the observation if the model's are.
+            The actions, (H, action_dim) float32. They are relative to the observation if the
+            model's actions are.
         """
         data = _with_prompt(observation, instruction) | {"actions": np.array(actions)}
         return np.asarray(self.forward(data)["actions"], np.float32)
@@ -261,9 +266,10 @@ class Transforms:
     def ranges(self, robot: RobotConvention) -> dict[str, Any] | None:
         """Return `HasStatistics.statistics` in the robot's units.
 
-        openpi's statistics are those of transformed numbers: some of ALOHA's joints change their
-        sign, and most actions are relative to the state. Random numbers show which of the robot's
-        numbers are only multiplied by a factor and shifted by an offset.
+        openpi computes its statistics from transformed numbers: the sign of some of ALOHA's joints
+        changes, and most actions are relative to the state. This method transforms random numbers
+        to find out which of the robot's numbers are only multiplied by a factor and shifted by an
+        offset.
 
         Args:
             robot: The convention of the robot.
@@ -278,8 +284,8 @@ class Transforms:
         state_dim = sum(sum(parts.values()) for parts in robot.state.values())
         dims = {"state": state_dim, "actions": action_dim}
 
-        # Zeros show the offsets, the first random sample the factors, and the second one checks
-        # them.
+        # Zeros show the offsets, the first random sample shows the factors, and the second sample
+        # checks them.
         rng = np.random.default_rng(0)
         samples, transformed = [], []
         for scale in (0, 1, 1):
@@ -299,7 +305,7 @@ class Transforms:
             factor[~is_scaled] = np.nan
 
             bounds = [(bound[name][:dim] - offset) / factor for bound in self.bounds]
-            lower, upper = np.sort(bounds, axis=0)  # a negative factor exchanges them
+            lower, upper = np.sort(bounds, axis=0)  # a negative factor swaps the bounds
             ranges[key] = {
                 _QUANTILES[0]: _none_for_nan(lower),
                 _QUANTILES[1]: _none_for_nan(upper),
@@ -310,7 +316,7 @@ class Transforms:
         self, robot: RobotConvention, state: np.ndarray, action: np.ndarray
     ) -> dict[str, Any]:
         """Return the result of `forward` for a state (D,), an action (D,) and black images."""
-        # `forward` may change arrays in place, so it gets copies.
+        # `forward` may change arrays in place, so copies are passed.
         data: dict[str, Any] = {"actions": np.array(action, ndmin=2)}
         image_shape = (224, 224, 3) if robot.layout == "hwc" else (3, 224, 224)
         for key in robot.cameras:
@@ -329,13 +335,16 @@ def _none_for_nan(values: np.ndarray) -> list[float | None]:
 
 
 def _with_prompt(observation: dict[str, Any], instruction: str) -> dict[str, Any]:
-    """Return an observation with its prompt, copied as deeply as openpi's transforms modify it."""
+    """Return a copy of an observation with its prompt.
+
+    The copy is as deep as openpi's transforms modify it.
+    """
     data: dict[str, Any] = require("jax").tree.map(np.array, observation)
     return data | {"prompt": instruction} if instruction else data
 
 
 def _quantiles(statistics: Mapping[str, Any]) -> list[dict[str, np.ndarray]]:
-    """Return `_QUANTILES` of "state" and "actions", one dict each; none if one is missing."""
+    """Return `_QUANTILES` of "state" and "actions", one dict each; empty if one is missing."""
     quantiles = []
     for quantile in _QUANTILES:
         values = {name: getattr(norm_stats, quantile) for name, norm_stats in statistics.items()}
@@ -373,7 +382,7 @@ def _read_statistics(folder: Path, asset: str | None) -> Any:
 
 
 class OpenPiConfig(AttentionConfig):
-    """Settings of openpi's policies, in addition to those of all models."""
+    """Settings of openpi's policies, in addition to the settings of all models."""
 
     config: str = Field(
         min_length=1,
@@ -416,9 +425,9 @@ class OpenPiConfig(AttentionConfig):
 
 logger = logging.getLogger(__name__)
 
-_STEPS = 10  # openpi's own default
-_END = 1  # PaliGemma's end of sequence
-_LISTED = 5  # names in a message
+_STEPS = 10  # default of openpi
+_END = 1  # PaliGemma's end-of-sequence token
+_LISTED = 5  # largest number of names in a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -428,26 +437,32 @@ class SampleBatch:
     inputs: dict[str, Any]  # stacked inputs of P observations, from `OpenPiModel.stack`
     rows: Sequence[Row]  # B rows, with plans in the model's units
     noise: np.ndarray  # (B, H, action_dim) float32
-    owners: Sequence[int]  # the observation of each row, from `ModelPolicy.observations_of`
-    dim: int | None  # how many numbers of an action are the robot's
+    # Index of the observation of each row, from `ModelPolicy.observations_of`.
+    owners: Sequence[int]
+    dim: int | None  # number of values of an action that the robot uses
 
 
 class OpenPiModel(abc.ABC):
     """The interface between a model and the policy."""
 
-    # (H, action_dim) of a row's noise; None for a model without noise.
+    # The shape of a row's noise, (H, action_dim); None for a model without noise.
     noise_shape: tuple[int, int] | None = None
     shares = False  # whether several rows can share one observation
     # The weights that a learner trains: a torch module, or nested dicts of JAX arrays.
     trained: Any
 
     def merge_products(self) -> None:
-        """Merge products, see `ModelPolicy.merge_products`; JAX's compiler does so by itself."""
+        """Merge products, see `ModelPolicy.merge_products`.
+
+        JAX's compiler merges them by itself.
+        """
         return
 
     def stage(self, inputs: dict[str, Any]) -> dict[str, Any]:
-        """Return the inputs of an observation for the session, and begin to copy them to the device
-        where the model can read them from there. Several threads may call it.
+        """Return the inputs of an observation for the session.
+
+        If the model can read inputs from the device, begin to copy them to it. Several threads may
+        call it.
         """
         return inputs
 
@@ -464,8 +479,8 @@ class OpenPiModel(abc.ABC):
             batch: The inputs.
 
         Returns:
-            Actions (B, H, action_dim) float32, or tokens (B, T) int32; and for the index of each
-            row that requests any, the values of its behaviour.
+            Actions (B, H, action_dim) float32, or tokens (B, T) int32; and a mapping from the index
+            of each row that requests outputs to the values of these outputs.
         """
 
 
@@ -473,8 +488,8 @@ class JaxFlow(OpenPiModel):
     """π0 and π0.5 in JAX, as two programs, each compiled once per number of rows.
 
     The first program computes the keys and values of images and instruction, once for each
-    observation. From these, the second integrates the flow of each row, in the steps of openpi's
-    `sample_actions`.
+    observation. From these, the second program integrates the flow of each row, with the same steps
+    as openpi's `sample_actions`.
     """
 
     shares = True
@@ -496,7 +511,7 @@ class JaxFlow(OpenPiModel):
             mask = make_attention_mask(present, causal)
             positions = jnp.cumsum(present, axis=1) - 1
             _, (keys, values) = model.PaliGemma.llm([tokens, None], mask=mask, positions=positions)
-            # Rows come before layers, so that `gather` can select rows.
+            # The first dimension is the rows, not the layers, so that `gather` can select rows.
             return keys.swapaxes(0, 1), values.swapaxes(0, 1), present, observation.state
 
         def follow(params: Any, encoded: Any, noise: Any, guide: Any) -> Any:
@@ -545,8 +560,8 @@ class JaxFlow(OpenPiModel):
             return jax.tree.map(lambda array: array[owners], encoded)
 
         self._encode = jax.jit(encode)
-        # A program for each pair of a number of observations and a number of rows: `gather`
-        # compiles in no time, while `follow` would take minutes for each.
+        # `gather` is compiled for each pair of a number of observations and a number of rows. It
+        # compiles quickly, while `follow` would take minutes for each pair.
         self._gather = jax.jit(gather)
         self._follow = jax.jit(follow)
         self.noise_shape = (network.action_horizon, network.action_dim)
@@ -567,7 +582,7 @@ class JaxFlow(OpenPiModel):
         if len(encoded[0]) < len(owners):
             encoded = self._gather(encoded, owners)
         actions = self._follow(self.trained, encoded, noise, device_guide)
-        return np.asarray(actions, np.float32), {}  # waits for the device
+        return np.asarray(actions, np.float32), {}  # this waits for the device
 
 
 class JaxTokens(OpenPiModel):
@@ -603,7 +618,7 @@ class JaxTokens(OpenPiModel):
         return np.where(np.cumsum(ends, axis=1) - ends > 0, 0, tokens)
 
 
-_SEPARATOR = "/"  # between the keys of nested inputs in the names of staged arrays
+_SEPARATOR = "/"  # separates the keys of nested inputs in the names of staged arrays
 
 
 class TorchFlow(OpenPiModel):
@@ -614,7 +629,7 @@ class TorchFlow(OpenPiModel):
     def __init__(
         self, network: Any, device: Any, config: OpenPiConfig, compilation: Compilation
     ) -> None:
-        """Prepare the passes of openpi's model, which is on the device."""
+        """Prepare the forward passes of openpi's model, which is already on the device."""
         self.trained = network
         self._staging = Staging(device)
         self._config = config
@@ -633,7 +648,7 @@ class TorchFlow(OpenPiModel):
         return tensors
 
     def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        """Compute actions (B, H, action_dim) float32, and requested values of behaviour."""
+        """Compute actions, (B, H, action_dim) float32, and the requested outputs."""
         observation = _observation(batch.inputs)
         with require("torch").inference_mode():
             return self._passes.chunks(
@@ -656,12 +671,12 @@ class TorchFlow(OpenPiModel):
 
 
 def _split(network: Any) -> tuple[dict[str, Any], Callable[[Any], Any]]:
-    """Return the parameters of a JAX model as nested dicts with openpi's names, and a function
-    that makes the model from them.
+    """Return the parameters of a JAX model as nested dicts with openpi's names, and a function that
+    makes the model from such dicts.
     """
     jax, nnx = require("jax"), require("flax.nnx")
     graph, state = nnx.split(network)
-    # The state has its leaves in the same order as the dicts, since both sort their keys.
+    # The leaves of the state and of the dicts have the same order, since both sort their keys.
     structure = jax.tree.structure(state)
 
     def merge(params: Any) -> Any:
@@ -729,8 +744,9 @@ def load_torch(
     device = torch_device(settings.device)
     file = folder / "model.safetensors"
     dtype = _dtype(settings, on_cpu=device.type == "cpu")
-    # In bfloat16, the network keeps some parameters in float32, such as those of its norms. openpi
-    # calls `to_bfloat16_for_selected_params` again after loading, which rounds these as well.
+    # In bfloat16, the network keeps some parameters in float32, such as the parameters of its
+    # norms. openpi calls `to_bfloat16_for_selected_params` again after loading, which also rounds
+    # these parameters.
     model = dataclasses.replace(config.model, pytorch_compile_mode=None, dtype=dtype)
     config = dataclasses.replace(config, model=model)
     try:
@@ -751,13 +767,14 @@ def _dtype(settings: OpenPiConfig, *, on_cpu: bool) -> str:
 
 def _observation(batch: dict[str, Any]) -> Any:
     """Return openpi's `Observation` of a batch of inputs."""
-    data = {**batch, "image": dict(batch["image"])}  # openpi writes into it
+    data = {**batch, "image": dict(batch["image"])}  # a copy, since openpi writes into it
     return require("openpi.models.model").Observation.from_dict(data)
 
 
 def _require_used(params: Any, network: Any, folder: Path, name: str) -> None:
-    """Raise `ConfigError` if the model does not use LoRA tensors of a checkpoint; log other unused
-    tensors, which base checkpoints have.
+    """Raise `ConfigError` if the model does not use LoRA tensors of a checkpoint.
+
+    Other unused tensors, which base checkpoints contain, are logged.
 
     Args:
         params: The parameters of the checkpoint.
@@ -799,10 +816,12 @@ class LoadedOpenPi:
 
 @dataclass(frozen=True)
 class OpenPiFrame:
-    """An observation in openpi's form, without the prompt, and the model's inputs made from it."""
+    """An observation in openpi's form, without the prompt, and the model's inputs that were made
+    from it.
+    """
 
-    observation: dict[str, Any]  # see `RobotConvention.read`
-    inputs: dict[str, Any]  # the result of `OpenPiModel.stage`
+    observation: dict[str, Any]  # result of `RobotConvention.read`
+    inputs: dict[str, Any]  # result of `OpenPiModel.stage`
 
 
 class OpenPi(ModelPolicy):
@@ -815,7 +834,10 @@ class OpenPi(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract of the checkpoint and its robot, which is empty before they are loaded."""
+        """The contract of the checkpoint and its robot.
+
+        It is empty before the checkpoint is loaded.
+        """
         if self.model is None:
             return Contract()
 
@@ -838,7 +860,10 @@ class OpenPi(ModelPolicy):
 
     @property
     def continues_plans(self) -> bool:
-        """Whether a chunk continues the executed plan: that of a flow, with `actions: chunk`."""
+        """Whether a chunk continues the executed plan.
+
+        Chunks of a flow do so with `actions: chunk`.
+        """
         is_flow = self.model is not None and self.model.model.noise_shape is not None
         return is_flow and self.config.actions == "chunk"
 
@@ -850,11 +875,11 @@ class OpenPi(ModelPolicy):
         transforms = Transforms.from_folder(config, folder)
         robot = choose_robot(config.name, transforms.robot, self.config)
 
-        # A transform that the user wrote may need more than the tried observation has.
+        # A transform that the user wrote may need keys that the tested observation does not have.
         statistics = attempt(transforms.ranges, robot)
         if isinstance(statistics, Exception):
             logger.warning(
-                "the statistics of the training are not stated: %s: %s",
+                "the statistics of the training are not available: %s: %s",
                 type(statistics).__name__,
                 statistics,
             )
@@ -865,7 +890,7 @@ class OpenPi(ModelPolicy):
         return LoadedOpenPi(model, transforms, robot, config.model.action_horizon)
 
     def _load_model(self, config: Any, folder: Path) -> OpenPiModel:
-        """Load the PyTorch model of a checkpoint, or else its JAX model."""
+        """Load the PyTorch model of a checkpoint; if there is none, load its JAX model."""
         if (folder / "model.safetensors").is_file():
             return load_torch(config, folder, self.config, self.compilation)
         if not (folder / "params").is_dir():
@@ -900,9 +925,10 @@ class OpenPi(ModelPolicy):
         planned = [attempt(self._planned, row) for row in rows]
         valid = [entry for entry in planned if not isinstance(entry, Exception)]
         if not valid:
-            return planned  # errors only
+            return planned  # contains only errors
 
-        # A valid row replaces each invalid one, so that the batch keeps a size that is compiled.
+        # A valid row replaces each invalid row, so that the size of the batch remains a compiled
+        # size.
         spare_row, spare_noise = valid[0]
         spare_row = replace(spare_row, want=())
         batch_rows: list[Row] = []
@@ -935,7 +961,7 @@ class OpenPi(ModelPolicy):
         return predictions
 
     def _planned(self, row: Row) -> tuple[Row, np.ndarray]:
-        """Return the row with its leftover actions in the model's units, and its noise."""
+        """Return the row with its leftover plan in the model's units, and the row's noise."""
         loaded = self.loaded()
         if row.leftover is not None:
             observation = row.frames[-1].observation
@@ -944,7 +970,7 @@ class OpenPi(ModelPolicy):
         return row, row.noise(*loaded.model.noise_shape or ())
 
     def _folder(self) -> Path:
-        """Return the folder of the checkpoint, which openpi downloads if it has a URL."""
+        """Return the folder of the checkpoint. openpi downloads the checkpoint if it is a URL."""
         name, step = self.config.checkpoint, self.config.checkpoint_step
         if _REMOTE not in name:
             return find_checkpoint(name, step, needs=["assets"])
@@ -952,7 +978,7 @@ class OpenPi(ModelPolicy):
         return find_checkpoint(str(require("openpi.shared.download").maybe_download(url)))
 
 
-SOURCE = "OPENPI_SRC"  # the variable that names a checkout; "openpi" on PyPI is another project
+SOURCE = "OPENPI_SRC"  # variable with the path of a checkout; "openpi" on PyPI is another project
 FOLDERS = ("src", "packages/openpi-client/src")  # folders of a checkout, from which Python imports
 
 
@@ -960,10 +986,10 @@ def train_config(name: str) -> Any:
     """Return openpi's `TrainConfig`.
 
     Args:
-        name: Its name in openpi, or "module:NAME".
+        name: The name of the config in openpi, or "module:NAME".
 
     Raises:
-        ConfigError: There is no such config.
+        ConfigError: The config does not exist.
     """
     configs = require("openpi.training.config")
     module, colon, attribute = name.partition(":")

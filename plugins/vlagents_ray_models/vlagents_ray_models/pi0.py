@@ -1,8 +1,8 @@
 """π0 in Hugging Face transformers: PaliGemma and an action expert with flow matching.
 
 A checkpoint is the folder of `PI0ForConditionalGeneration.save_pretrained` and
-`PI0Processor.save_pretrained`. Physical Intelligence's own code and checkpoints are
-`vlagents_ray_models.openpi`.
+`PI0Processor.save_pretrained`. The module `vlagents_ray_models.openpi` runs Physical Intelligence's
+own code and checkpoints.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ logger = logging.getLogger(__name__)
 
 # openpi's names, in the order of the image tokens.
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
-# Defaults: openpi's name of each camera -> ours, and the parts of LIBERO's state.
+# The defaults: openpi's name of each camera -> our camera, and the parts of LIBERO's state.
 DEFAULT_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
 DEFAULT_STATE = ("xyz_axis_angle", "gripper_qpos")
-_ROUNDING = 1e-5  # rounding of float32, for pixels of about 1
+_ROUNDING = 1e-5  # rounding error of float32 for pixels of about 1
 _EPSILON = 1e-8  # added to a standard deviation by PI0Processor
-_BILINEAR = 2  # Pillow's number of that filter
+_BILINEAR = 2  # Pillow's number of the bilinear filter
 _PROCESSOR = "processor_config.json"
 _STATISTICS = ("state_mean", "state_std", "actions_mean", "actions_std")
 
@@ -57,7 +57,7 @@ InputStyle = Literal["transformers", "openpi"]
 
 
 class Pi0Config(AttentionConfig):
-    """Settings of π0, in addition to those of all models."""
+    """Settings of π0, in addition to the settings of all models."""
 
     cameras: dict[str, str] | None = Field(
         default=None,
@@ -66,8 +66,9 @@ class Pi0Config(AttentionConfig):
     )
     images: InputStyle | None = Field(
         default=None,
-        description="whose code prepared images and instructions in training: openpi for weights "
-        "converted from there; unset: transformers, unless its image processor resizes bilinearly "
+        description="the code that prepared images and instructions in training: openpi for "
+        "weights that were converted from openpi; unset: transformers, unless its image processor "
+        "resizes bilinearly "
         "or does not pad",
     )
     steps: int | None = Field(
@@ -91,10 +92,10 @@ class LoadedPi0:
     dtype: Any
     passes: Pi0HfPasses
     staging: Staging
-    scale: tuple[Any, Any, Any]  # see `_scale`
+    scale: tuple[Any, Any, Any]  # result of `_scale`
 
     def normalised_plan(self, row: Row) -> Row:
-        """Return the row with its leftover actions in the model's units."""
+        """Return the row with its leftover plan in the model's units."""
         if row.leftover is None:
             return row
         mean, std = self._statistics()
@@ -143,14 +144,15 @@ class Pi0(ModelPolicy):
 
     @property
     def continues_plans(self) -> bool:
-        """Whether a chunk continues the executed plan, as it does with `actions: chunk`."""
+        """Whether a chunk continues the executed plan, which requires `actions: chunk`."""
         return self.config.actions == "chunk"
 
     def load(self) -> LoadedPi0:
         """Read the checkpoint.
 
         Raises:
-            ConfigError: It is incomplete, or its image processor does more than scale.
+            ConfigError: The checkpoint is incomplete, or its image processor does more than scale
+                pixels.
         """
         path = find_checkpoint(
             self.config.checkpoint,
@@ -176,10 +178,10 @@ class Pi0(ModelPolicy):
         self.loaded().passes.merge_products()
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Check that an adapter's folder has no statistics, or those of the base.
+        """Check that an adapter's folder has no statistics, or the same statistics as the base.
 
         Raises:
-            ConfigError: Its statistics differ from the base's.
+            ConfigError: The adapter's statistics differ from the base's.
         """
         file = folder / _PROCESSOR
         if not file.is_file():
@@ -203,7 +205,8 @@ class Pi0(ModelPolicy):
         """Return the model's inputs for one row: resized images, normalised state, and the
         episode's tokens.
 
-        Several threads call it, so it never uses the tokenizer, whose padding is mutable state.
+        Several threads call this method, so it never uses the tokenizer, whose padding is mutable
+        state.
         """
         model, torch = self.loaded(), require("torch")
         cameras = camera_images(obs, self.cameras)
@@ -219,7 +222,7 @@ class Pi0(ModelPolicy):
         return staged
 
     def _style(self, processor: Any) -> InputStyle:
-        """Return whose preparation of images and instructions the checkpoint was trained with."""
+        """Return which code prepared images and instructions in the checkpoint's training."""
         if self.config.images is not None:
             return self.config.images
         images = processor.image_processor
@@ -262,7 +265,7 @@ class Pi0(ModelPolicy):
 
         Raises:
             InvalidObservation: The instruction is longer than in training, or contains the token of
-                an image; it is never truncated.
+                an image. It is never truncated.
         """
         super()._begin(instruction, seed, adapter)
         if self.model is None:
@@ -323,10 +326,10 @@ class Pi0(ModelPolicy):
         return predictions
 
     def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """Return the inputs of the network, by transformers' names, for the last observations of
-        rows.
+        """Return the inputs of the network for the last observations of rows, under transformers'
+        names.
 
-        Their images are scaled on the device, as the image processor does.
+        The images are scaled on the device, in the same way as in the image processor.
         """
         model, torch = self.loaded(), require("torch")
         inputs: dict[str, Any] = model.staging.stack([row.frames[-1] for row in rows])
@@ -353,9 +356,9 @@ class Pi0(ModelPolicy):
 
 
 def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
-    """Return the cameras in the order of the model's image tokens: openpi's name -> ours.
+    """Return the cameras in the order of the model's image tokens: openpi's name -> our camera.
 
-    A checkpoint may be trained without some of them.
+    A checkpoint may have been trained without some cameras.
     """
     cameras = DEFAULT_CAMERAS if chosen is None else chosen
     expected: Sequence[str] = CAMERAS
@@ -370,7 +373,10 @@ def _openpi_text(instruction: str) -> str:
 
 
 def _processor(path: Path) -> Any:
-    """Load the processor of a checkpoint; raise `ConfigError` if it has no statistics."""
+    """Load the processor of a checkpoint.
+
+    Raise `ConfigError` if the processor has no statistics.
+    """
     processor = require("transformers").PI0Processor.from_pretrained(path, local_files_only=True)
     absent = [name for name in _STATISTICS if getattr(processor, name) is None]
     if absent:
@@ -389,11 +395,11 @@ def _scale(processor: Any, staging: Staging) -> tuple[Any, Any, Any]:
         staging: Copies the result to the device.
 
     Returns:
-        The factor and the summand of pixels, and the converted colour with which images are padded;
-        each (3, 1, 1) float32 on the device.
+        The factor and the summand of pixels, and the converted padding colour of images, each (3,
+        1, 1) float32 on the device.
 
     Raises:
-        ConfigError: The processor does anything else with an image of the network's size.
+        ConfigError: The processor changes an image of the network's size in any other way.
     """
     image_processor = processor.image_processor
     side = image_processor.pad_size
@@ -402,7 +408,7 @@ def _scale(processor: Any, staging: Staging) -> tuple[Any, Any, Any]:
     [converted] = image_processor([image], return_tensors="np")["pixel_values"]
     converted = np.asarray(converted, np.float32)
 
-    summand = converted[:, :1, :1]  # summand of black, the first pixel
+    summand = converted[:, :1, :1]  # the first pixel is black, so its result is the summand
     white = converted[:, levels == 255][:, :1, None]
     factor = (white - summand) / np.float32(255)
     if converted.shape != (3, *levels.shape) or not np.allclose(
@@ -424,15 +430,13 @@ def _scale(processor: Any, staging: Staging) -> tuple[Any, Any, Any]:
 
 
 class Pi0HfPasses(FlowPasses):
-    """The passes of a `PI0ForConditionalGeneration`.
+    """The forward passes of a `PI0ForConditionalGeneration`.
 
-    Once for each act: `encode` computes keys and values of the prefix (images and instruction),
-    `constants` the mask and the positions with which the steps attend to it, and `at_times` the
-    embeddings of the flow times. In each step: `velocity` embeds noisy actions, and runs the layers
-    of the action expert.
-
-    As in openpi, actions stay in float32 between the steps even if the model computes in another
-    type.
+    Once for each call of the policy, `encode` computes the keys and values of the prefix (images
+    and instruction), `constants` computes the mask and the positions with which the steps attend to
+    the prefix, and `at_times` computes the embeddings of the flow times. In each step, `velocity`
+    embeds the noisy actions and runs the layers of the action expert. As in openpi, actions stay in
+    float32 between the steps even if the model computes in another type.
     """
 
     by_regions = True
@@ -440,12 +444,12 @@ class Pi0HfPasses(FlowPasses):
     def __init__(
         self, network: Any, compilation: Compilation, attention: Attention = "sdpa"
     ) -> None:
-        """Create the forward passes of a network, compiled where `compilation` does so.
+        """Create the forward passes of a network, which `compilation` may compile.
 
         Args:
             network: The `PI0ForConditionalGeneration`.
             compilation: Compiles the passes.
-            attention: How compiled steps compute attention.
+            attention: The attention kernel of compiled steps.
         """
         super().__init__(network, compilation)
         model = network.model
@@ -461,14 +465,17 @@ class Pi0HfPasses(FlowPasses):
     def encode(
         self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
     ) -> tuple[Any, Any]:
-        """Return keys and values (P, layers, 2, heads, L, E), and the mask; `images` is one tensor
-        (P, cameras, 3, S, S).
+        """Return the keys and values, (P, layers, 2, heads, L, E), and the mask.
+
+        `images` is one tensor, (P, cameras, 3, S, S).
         """
         embedded = self.model.model.embed_prefix(tokens, images[0], cameras)
         return self._language_model.encode(embedded, mask), mask
 
     def constants(self, encoded: Any, present: Any, state: Any, horizon: int) -> tuple[Any, ...]:
-        """Return encoded, mask, rotation, the embedding of the state, and the scales of norms."""
+        """Return `encoded`, the mask, the rotation, the embedding of the state, and the scales
+        of norms.
+        """
         constants = self._expert.constants(encoded, present, 1 + horizon, has_state=True)
         embedded_state = self.model.embed_action_time.state_proj(state)
         return *constants, embedded_state, self._expert.scales(len(state))
@@ -490,9 +497,9 @@ class Pi0HfPasses(FlowPasses):
 def flow_velocity(
     network: Any, inputs: Mapping[str, Any], dtype: Any, owners: Sequence[int] | None = None
 ) -> Callable[[Any, float], Any]:
-    """Return the velocity for a learner, as a function of noisy actions (B, H, D) and flow time.
+    """Return the velocity for a learner, as a function of noisy actions, (B, H, D), and flow time.
 
-    The inputs are encoded once. The passes are those of transformers itself, as in training: they
+    The inputs are encoded once. This uses the forward passes of transformers, as in training: they
     call the hooks of each layer, which sharded training needs.
 
     Args:
@@ -500,7 +507,8 @@ def flow_velocity(
         inputs: Tokens, images and states of P observations, as `PI0Processor` returns them, on the
             network's device.
         dtype: The type in which the network computes.
-        owners: The observation of each of the B rows; None: row i belongs to observation i.
+        owners: The index of the observation of each of the B rows; None means that row i belongs to
+            observation i.
 
     Returns:
         The function, whose result is (B, H, D) float32.
@@ -524,7 +532,8 @@ def flow_velocity(
 
     def velocity(actions: Any, time: float) -> Any:
         times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
-        # For this step only, which appends to it: later ones must not attend to its tokens.
+        # Each step needs a new cache, since it appends its tokens, to which later steps must not
+        # attend.
         cache = cache_of(encoded.unbind(1))
         output = network(
             state=state,

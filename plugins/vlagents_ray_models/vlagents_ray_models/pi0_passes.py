@@ -1,9 +1,10 @@
-"""The passes of openpi's PyTorch port of π0 and π0.5, which both openpi and LeRobot contain.
+"""The forward passes of openpi's PyTorch port of π0 and π0.5, which openpi and LeRobot contain.
 
-Once for each act: `encode` computes keys and values of the prefix (images and instruction),
-`constants` the mask and the positions with which the steps attend to it, and `at_times` what
-follows from the flow times: their embeddings, and in π0.5 what the norms compute of these. In each
-step: `velocity` embeds noisy actions, and runs the layers of the action expert.
+Once for each call of the policy, `encode` computes the keys and values of the prefix (images and
+instruction), `constants` computes the mask and the positions with which the steps attend to the
+prefix, and `at_times` computes the embeddings of the flow times and, for π0.5, the modulation of
+the norms. In each step, `velocity` embeds the noisy actions and runs the layers of the action
+expert.
 """
 
 from __future__ import annotations
@@ -16,17 +17,19 @@ from vlagents_ray.policies.flow import FlowPasses
 from vlagents_ray_models.action_tokens import action_tokens
 from vlagents_ray_models.gemma_layers import Attention, GemmaLayers, compile_vision_layers
 
-# Periods of the sine and cosine of a flow time in openpi; LeRobot has them in its config.
+# Shortest and longest period of the sines and cosines of a flow time in openpi. LeRobot has these
+# values in its config.
 _MIN_PERIOD, _MAX_PERIOD = 4e-3, 4.0
 
 
 class Pi0Passes(FlowPasses):
-    """The passes of a `PI0Pytorch` or a `PI05Pytorch`."""
+    """The forward passes of a `PI0Pytorch` or a `PI05Pytorch`."""
 
     by_regions = True
 
     def __init__(self, model: Any, compilation: Compilation, *, takes_state: bool = True) -> None:
-        """Use the passes of a model, whose `embed_prefix` then also accepts features of images.
+        """Use the forward passes of a model, whose `embed_prefix` then also accepts features of
+        images.
 
         Args:
             model: The `PI0Pytorch` or `PI05Pytorch`.
@@ -46,7 +49,7 @@ class Pi0Passes(FlowPasses):
         super().__init__(model, compilation)
 
     def use_attention(self, attention: Attention) -> None:
-        """Set how compiled steps compute attention."""
+        """Set the attention kernel of compiled steps."""
         self._expert.attention = attention
 
     def merge_products(self) -> None:
@@ -56,12 +59,14 @@ class Pi0Passes(FlowPasses):
     def encode(
         self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
     ) -> tuple[Any, Any]:
-        """Return keys and values, (P, layers, 2, heads, L, E), and the mask of the tokens, (P, L);
-        the state is not read.
+        """Return keys and values, (P, layers, 2, heads, L, E), and the mask of the tokens, (P, L).
+
+        The state is not used.
         """
         import torch  # torch's compiler follows this statement, but not `require`
 
-        # One call for the images of all cameras. Those of a row are adjacent, as adapters expect.
+        # One call encodes the images of all cameras. The images of a row are adjacent, as adapters
+        # expect.
         pixels = torch.stack(images, 1)
         features = self._embed_image(pixels.flatten(0, 1)).unflatten(0, pixels.shape[:2])
         embedded, present, _ = self.model.embed_prefix(
@@ -70,8 +75,8 @@ class Pi0Passes(FlowPasses):
         return self._language_model.encode(embedded, present), present.long()
 
     def constants(self, encoded: Any, present: Any, state: Any, horizon: int) -> tuple[Any, ...]:
-        """Return encoded, mask and rotation; of π0 also the embedding of the state, and the scales
-        of its norms.
+        """Return `encoded`, the mask and the rotation; for π0, also the embedding of the state and
+        the scales of the norms.
         """
         has_state = self._has_state_token
         tokens = horizon + has_state
@@ -84,7 +89,9 @@ class Pi0Passes(FlowPasses):
 
     def at_times(self, times: Any) -> Any:
         """Return the modulation of π0.5's norms, (B, K, norms, 3, 1, D), or the embeddings of the
-        times of π0, (B, K, D). Times of each row of a chunk are returned as they are.
+        times of π0, (B, K, D).
+
+        Times with a value for each row of a chunk are returned unchanged.
         """
         if self.by_row:
             return times
@@ -108,18 +115,18 @@ class Pi0Passes(FlowPasses):
         return self.model.action_out_proj(hidden[:, -actions.shape[1] :].float())
 
     def _condition(self, times: Any) -> Any:
-        """Return the condition of π0.5's norms at times (rows,), (rows, C), or at times (rows, H),
-        (rows, H, C).
+        """Return the condition of π0.5's norms: (rows, C) for times (rows,), or (rows, H, C) for
+        times (rows, H).
         """
         tokens = times.shape[1] if times.ndim == 2 else 1
-        # Only their embeddings depend on the actions, and are not used.
+        # Only the embeddings of the actions depend on the actions, and they are not used.
         actions = times.new_zeros(len(times), tokens, self.model.action_in_proj.in_features)
         arguments = (None, actions, times) if self._takes_state else (actions, times)
         _, _, _, condition = self.model.embed_suffix(*arguments)
         return condition
 
     def _embedded_times(self, times: Any) -> Any:
-        """Return the embeddings (B, K, D) of times (B, K), which are the same for all rows."""
+        """Return the embeddings, (B, K, D), of times (B, K) that are the same for all rows."""
         settings = self.model.config
         embedded = self.module.create_sinusoidal_pos_embedding(
             times[0],
@@ -131,5 +138,8 @@ class Pi0Passes(FlowPasses):
         return embedded.to(times.dtype).expand(len(times), -1, -1)
 
     def _features(self, image: Any) -> Any:
-        """Return the features of an image (P, 3, H, W); features (P, L, E) are returned as is."""
+        """Return the features of an image (P, 3, H, W).
+
+        Features (P, L, E) are returned unchanged.
+        """
         return image if image.ndim == 3 else self._embed_image(image)

@@ -1,4 +1,4 @@
-"""What this distribution registers: an entry for each policy."""
+"""The registry entries of this distribution, one for each policy."""
 
 from vlagents_ray.registry import RegistryEntry
 

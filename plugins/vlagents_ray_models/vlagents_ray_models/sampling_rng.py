@@ -1,4 +1,4 @@
-"""Random numbers of a session for models that draw from torch's global generator."""
+"""Session-specific random numbers for models that draw from torch's global generator."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.policies.base import Row
 
 _SEEDS = 2**63
-# The draws of the pass that this thread runs.
+# The draws of this thread's forward pass.
 _DRAWS: ContextVar[RowDraws | None] = ContextVar("draws", default=None)
 
 
 def generator_of(rng: np.random.Generator) -> Any:
     """Make a torch generator that is seeded from `rng`.
 
-    It is on the CPU, so that draws are the same on every device.
+    The generator is on the CPU, so that draws are the same on every device.
     """
     return torch.Generator().manual_seed(int(rng.integers(_SEEDS)))
 
@@ -44,10 +44,11 @@ def seeded(rng: np.random.Generator, device: Any) -> Iterator[None]:
 class RowDraws:
     """A context in which a model's code draws each row of a batch from that row's generator.
 
-    Only the modules that define the model's own class draw this way, with `torch.randn` and
-    `torch.multinomial`; they may not draw otherwise. Layers and other threads are not affected,
-    unlike with torch's function modes, which also make each call of torch slower by half. The batch
-    must be the first dimension of every draw, or the outer part of that dimension.
+    Only the modules that define the model's own class draw in this way, with `torch.randn` and
+    `torch.multinomial`; any other draw in these modules is an error. Layers and other threads are
+    not affected. torch's function modes would affect them, and would also make each call of torch
+    take half as long again. The batch must be the first dimension of every draw, or the outer part
+    of that dimension.
     """
 
     def __init__(self, rngs: Sequence[np.random.Generator], *models: Any) -> None:
@@ -55,7 +56,7 @@ class RowDraws:
 
         Args:
             rngs: The generator of each row.
-            models: Objects, whose classes' modules are meant, or modules.
+            models: Modules, or objects, which stand for the modules of their classes.
         """
         self._rngs = rngs
         self._has_drawn = False
@@ -108,7 +109,7 @@ class RowDraws:
         return self._randn(tuple(shape), options.get("device"), options.get("dtype"))
 
     def _randn(self, shape: tuple[int, ...], device: Any, dtype: Any) -> Any:
-        """Draw standard normal numbers, with the same number of entries for each row."""
+        """Draw standard normal numbers. Each row has the same number of entries."""
         entries = shape[0] // len(self._generators)
         drawn = [
             torch.randn(entries, *shape[1:], generator=generator) for generator in self._generators
@@ -116,7 +117,7 @@ class RowDraws:
         return torch.cat(drawn).to(device=device, dtype=dtype, non_blocking=True)
 
     def _multinomial(self, weights: Any, num_samples: int) -> Any:
-        """Draw indices with these weights, of which each row has the same number of entries."""
+        """Draw indices with these weights. Each row has the same number of entries."""
         blocks = weights.float().cpu().chunk(len(self._generators))
         drawn = []
         for block, generator in zip(blocks, self._generators, strict=True):
@@ -125,27 +126,31 @@ class RowDraws:
 
 
 def _modules_of(model: Any) -> list[Any]:
-    """Return the modules that define the class of an object and its bases, or a module itself."""
+    """Return the modules that define the class of an object and the base classes.
+
+    For a module, return the module itself.
+    """
     if isinstance(model, ModuleType):
         return [model]
     return [sys.modules.get(base.__module__) for base in type(model).__mro__]
 
 
 class RowNoise(RowDraws):
-    """`RowDraws` with the numbers of `Row.noise`; every batch has one entry for each row."""
+    """A `RowDraws` that uses the numbers of `Row.noise`. Every batch has one entry for each row."""
 
     def __init__(self, rows: Sequence[Row], ahead: int, *models: Any) -> None:
         """Replace `torch` in the modules of models, so that they can draw for rows.
 
         Args:
             rows: The rows.
-            ahead: How many of the first draws have one shape; they are made and copied together.
+            ahead: The number of first draws that have the same shape. They are made and copied
+                together.
             models: As for `RowDraws`.
         """
         super().__init__([row.rng for row in rows], *models)
         self._rows = rows
         self._ahead = ahead
-        self._prepared: list[Any] = []  # the results of the next draws
+        self._prepared: list[Any] = []  # prepared results of the next draws
 
     def _randn(self, shape: tuple[int, ...], device: Any, dtype: Any) -> Any:
         if len(shape) < 2 or shape[0] != len(self._rows):
@@ -169,7 +174,7 @@ def _draw(name: str, *args: Any, **options: Any) -> Any:
     return draws.draw(name, *args, **options)
 
 
-# Replaces `torch` in modules that draw. All other attributes are torch's own; they are copied, so
+# Replaces `torch` in modules that draw. All other attributes are torch's own. They are copied, so
 # that reading them calls no Python function.
 _TORCH = ModuleType("torch")
 vars(_TORCH).update(vars(torch), __getattr__=partial(getattr, torch))

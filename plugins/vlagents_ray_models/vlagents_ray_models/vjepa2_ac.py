@@ -1,5 +1,5 @@
-"""V-JEPA 2-AC (arXiv 2506.09985), which plans to a goal image in a learned world model with the
-cross-entropy method.
+"""V-JEPA 2-AC (arXiv 2506.09985), which plans towards a goal image in a learned world model with
+the cross-entropy method.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from vlagents_ray_models.model_code import use_source
 
 
 class VJepa2AcConfig(ModelConfig):
-    """Settings of V-JEPA 2-AC: its checkpoint and the search for plans, in addition to the
+    """Settings of V-JEPA 2-AC for its checkpoint and the search for plans, in addition to the
     settings of all models.
     """
 
@@ -53,8 +53,8 @@ class VJepa2AcConfig(ModelConfig):
     )
     source_dir: str | None = Field(
         default=None,
-        description="checkout of vjepa2, for the predictor's code; unset: that of VJEPA2_SRC, or "
-        "installed",
+        description="checkout of vjepa2, for the predictor's code; unset: the checkout that "
+        "VJEPA2_SRC names, or the installed package",
     )
     encoder_heads: int | None = Field(
         default=None,
@@ -95,7 +95,7 @@ class VJepa2AcConfig(ModelConfig):
     )
     maxnorm: float = Field(default=0.05, gt=0, description="largest step along each axis, m")
     close_gripper: int | None = Field(
-        default=None, ge=0, description="step of a plan from which on the gripper closes"
+        default=None, ge=0, description="step of a plan at which the gripper begins to close"
     )
     pass_size: int = Field(
         default=400, ge=1, description="largest number of plans in a forward pass of the predictor"
@@ -103,8 +103,9 @@ class VJepa2AcConfig(ModelConfig):
 
     @property
     def plans_a_pass(self) -> int:
-        """The largest number of plans in a forward pass of the predictor; compiled, full passes
-        have this number.
+        """The largest number of plans in a forward pass of the predictor.
+
+        With compilation, full passes have this number of plans.
         """
         return min(self.samples, self.pass_size) if self.compile else self.pass_size
 
@@ -118,13 +119,13 @@ class VJepa2AcConfig(ModelConfig):
         return self
 
 
-# Colours of ImageNet, in [0, 1].
+# Mean and standard deviation of ImageNet's colours, in [0, 1].
 _MEAN = (0.485, 0.456, 0.406)
 _STD = (0.229, 0.224, 0.225)
-# Width of an encoder -> its attention heads, for ViT-L, ViT-H and ViT-g.
+# Width of an encoder -> number of its attention heads, for ViT-L, ViT-H and ViT-g.
 _HEADS = {1024: 16, 1280: 16, 1408: 22}
 
-# Tensors of an encoder, by transformers' names.
+# The name in transformers -> tensor of an encoder.
 _PATCHES = "encoder.embeddings.patch_embeddings.proj.weight"
 _FIRST_MLP = "encoder.layer.0.mlp.fc1.weight"
 
@@ -164,7 +165,7 @@ def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any
         A `VJEPA2Model` of transformers.
 
     Raises:
-        ConfigError: There is no encoder, it lacks weights, or it is for images of another size.
+        ConfigError: There is no encoder, or it lacks weights, or it needs images of another size.
     """
     ensure_torchvision()
     transformers = require("transformers")
@@ -214,7 +215,7 @@ def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
         num_attention_heads=heads,
         num_hidden_layers=len(layers),
         mlp_ratio=tensors[_FIRST_MLP].shape[0] / width,
-        pred_num_hidden_layers=1,  # V-JEPA 2's own predictor of masked patches is not used
+        pred_num_hidden_layers=1,  # V-JEPA 2's predictor of masked patches is not used.
     )
     model = transformers.VJEPA2Model(settings)
     model.predictor = require("torch").nn.Identity()
@@ -229,9 +230,9 @@ def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
 
 
 def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Return upstream's tensors by transformers' names.
+    """Return upstream's tensors under transformers' names.
 
-    Upstream stores query, key and value in one matrix, transformers in three.
+    Upstream stores query, key and value in one matrix, while transformers uses three matrices.
     """
     tensors: dict[str, Any] = {}
     for upstream_name, tensor in saved.items():
@@ -254,12 +255,12 @@ def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
     return tensors
 
 
-# Prefixes of names, from distributed training and upstream's wrapper.
+# The prefixes of names that distributed training and upstream's wrapper add.
 _PREFIXES = re.compile(r"module\.|backbone\.")
 
 
 def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
-    """Read upstream's file, of which nothing is unpickled but tensors.
+    """Read upstream's file. Only tensors are unpickled.
 
     Args:
         config: The settings of the policy, which name the checkpoint.
@@ -268,7 +269,7 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
         The tensors by name of each network in the file: "predictor", and "encoder" if there is one.
 
     Raises:
-        ConfigError: There is no file, or there are several, or it has no predictor.
+        ConfigError: There is no file, or there are several files, or the file has no predictor.
     """
     torch = require("torch")
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, needs=("*.pt",))
@@ -282,7 +283,7 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
     [file] = files
     try:
         content = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # the file may not be a zip file, or may be a pickle of other types
+    except Exception as error:  # The file may not be a zip file, or may be a pickle of other types.
         raise ConfigError(
             f"checkpoint {file}: expected upstream's .pt, a file of tensors, got another "
             f"({type(error).__name__})"
@@ -314,11 +315,11 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
         width: The width of the encoder's features.
 
     Returns:
-        The network, of upstream's own code.
+        The network, an instance of upstream's own class.
 
     Raises:
         MissingDependency: The predictor's code is missing.
-        ConfigError: A weight is missing, or the encoder does not fit.
+        ConfigError: A weight is missing, or the predictor does not fit the encoder.
     """
     use_source("src", "VJEPA2_SRC", config.source_dir)
     try:
@@ -342,7 +343,7 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
     blocks = {name.split(".")[1] for name in saved if name.startswith("predictor_blocks.")}
     model = module.vit_ac_predictor(
         img_size=(config.image_size, config.image_size),
-        # Tubelets have two frames; this sets only the size of the mask.
+        # Tubelets have two frames. This value determines only the size of the mask.
         num_frames=2 * config.rollout,
         tubelet_size=2,
         embed_dim=width,
@@ -364,7 +365,7 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
 def default_attention() -> Iterator[None]:
     """Make upstream's attention use the kernel that torch selects.
 
-    Upstream selects one itself, which cannot be compiled.
+    Upstream's own selection of a kernel cannot be compiled.
     """
     backend = require("torch").backends.cuda
     setter, backend.sdp_kernel = backend.sdp_kernel, nullcontext
@@ -374,14 +375,14 @@ def default_attention() -> Iterator[None]:
         backend.sdp_kernel = setter
 
 
-Tensor = Any  # torch's
+Tensor = Any  # a tensor of torch
 World = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Predicts the next frame's features (M, N, F) from features (M, T, N, F), actions (M, T, 7) and
 poses (M, T, 7).
 """
 
-DRAWN = 4  # sampled components of an action: x, y, z and the gripper
-_MAX_GRIPPER_CHANGE = 0.75  # in a step
+DRAWN = 4  # number of sampled components of an action: x, y, z and the gripper
+_MAX_GRIPPER_CHANGE = 0.75  # largest change of the gripper in a step
 _MIN_GRIPPER_CHANGE = 0.25  # smaller changes become zero
 
 
@@ -390,8 +391,8 @@ class Plans:
     """The plans of all sessions."""
 
     actions: Tensor  # (B, H, 7)
-    std: Tensor  # (B, H, 7), of the last distribution
-    energy: Tensor  # (B,), distance of the last iteration's best plan from the goal
+    std: Tensor  # standard deviation of the last distribution, (B, H, 7)
+    energy: Tensor  # distance of the last iteration's best plan from the goal, (B,)
 
 
 def plan(
@@ -402,7 +403,8 @@ def plan(
     noise: Tensor,
     config: VJepa2AcConfig,
 ) -> Plans:
-    """Search for plans with the cross-entropy method, in I iterations of S samples of H actions.
+    """Search for plans with the cross-entropy method, in I iterations with S samples of H actions
+    each.
 
     Args:
         world: The predictor.
@@ -458,7 +460,7 @@ def _actions(samples: Tensor) -> Tensor:
 def _energies(
     world: World, features: Tensor, poses: Tensor, goals: Tensor, actions: Tensor, pass_size: int
 ) -> Tensor:
-    """Compute how far plans end from their goals.
+    """Compute the distances between the ends of plans and their goals.
 
     Args:
         world: The predictor.
@@ -488,11 +490,12 @@ def _energies(
 
 
 def moved(poses: Tensor, actions: Tensor) -> Tensor:
-    """Return poses after actions.
+    """Return the poses that result from actions.
 
     Args:
-        poses: (M, 7): x, y, z, m; Euler angles, rad; closedness of the gripper in [0, 1].
-        actions: (M, 7), changes of these, without rotation.
+        poses: The poses before the actions, (M, 7): x, y, z in m; Euler angles in rad; closedness
+            of the gripper in [0, 1].
+        actions: Changes of these values, (M, 7), without rotation.
 
     Returns:
         The poses, (M, 7).
@@ -502,22 +505,25 @@ def moved(poses: Tensor, actions: Tensor) -> Tensor:
     return torch.cat([poses[:, :3] + actions[:, :3], poses[:, 3:6], closedness], -1)
 
 
-CAMERA = "front"  # the model has one unnamed camera
+CAMERA = "front"  # The model has one unnamed camera.
 _STATE = ["xyzrpy"]
 _GOAL = "goal"  # key in a session's memory
 
 
 class Goal:
-    """A goal image, and its features once they are computed; a copy or a pickle needs no device."""
+    """A goal image, and its features once they are computed.
+
+    Copying or pickling it needs no device.
+    """
 
     def __init__(self, pixels: np.ndarray, features: Any = None) -> None:
         self.pixels = pixels  # (3, side, side) float32
-        # (N, F) float32: a tensor on the model's device, or an array from a pickle; None before
-        # they are computed.
+        # The features, (N, F) float32: a tensor on the model's device, or an array from a pickle;
+        # None before they are computed.
         self.features = features
 
     def __deepcopy__(self, memo: object) -> Goal:
-        return self  # samples of a session copy its memory, and share the features
+        return self  # samples of a session copy the session's memory, and share the features
 
     def __reduce__(self) -> tuple[type[Goal], tuple[np.ndarray, np.ndarray | None]]:
         features = self.features
@@ -534,7 +540,7 @@ _POSE = "pose"  # (7,) float32: x, y, z m, roll, pitch, yaw rad, closedness
 class WorldModel:
     """The encoder and the predictor.
 
-    Weights and features are float32, but computations may use another type.
+    Weights and features are float32, although computations may use another type.
     """
 
     def __init__(
@@ -547,7 +553,7 @@ class WorldModel:
     ) -> None:
         self._encoder, self._predictor = encoder, predictor
         self._encode = compilation.core("encode", self._features)
-        # Number of known frames - 1 -> the predictor of the next frame.
+        # The number of known frames minus 1 -> the compiled predictor of the next frame.
         self._predictors = []
         for frames in range(1, config.rollout + 1):
             name = f"predict frame {frames + 1}"
@@ -558,9 +564,9 @@ class WorldModel:
         self.staging = Staging(encoder.device)
 
     def autocast(self) -> Any:
-        """Return a context that computes in `dtype`, as in upstream's training.
+        """Return a context in which computations use `dtype`, as in upstream's training.
 
-        Attention needs weights of one type.
+        Attention needs weights of a single type.
         """
         torch = require("torch")
         return torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
@@ -570,7 +576,8 @@ class WorldModel:
         return self._encode(images.to(self._encoder.dtype))
 
     def _features(self, images: Tensor) -> Tensor:
-        clip = images[:, None].repeat(1, 2, 1, 1, 1)  # the two frames of one step of the encoder
+        # The two frames of one time step of the encoder.
+        clip = images[:, None].repeat(1, 2, 1, 1, 1)
         encoded = self._encoder(pixel_values_videos=clip, skip_predictor=True)
         return self._normalized(encoded.last_hidden_state.float())
 
@@ -581,7 +588,7 @@ class WorldModel:
         return self._layer_norm(features, features.shape[-1:])
 
     def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
-        """Predict the next frame's features (see `World`)."""
+        """Predict the features of the next frame (see `World`)."""
         predict = self._predictors[features.shape[1] - 1]
         return predict(features, actions, poses)
 
@@ -592,10 +599,10 @@ class WorldModel:
 
 
 class VJepa2Ac(ModelPolicy):
-    """Moves the gripper so that the camera's image becomes `info["goal_image"]`.
+    """A policy that moves the gripper until the camera's image equals the goal image.
 
-    The goal image is in the observation of `reset` or any later one, and remains valid until the
-    next one.
+    The goal image is `info["goal_image"]` in the observation of `reset` or in any later
+    observation. It remains valid until the next goal image.
     """
 
     Config: ClassVar[type] = VJepa2AcConfig
@@ -627,7 +634,7 @@ class VJepa2Ac(ModelPolicy):
         )
 
     def load(self) -> WorldModel:
-        """Read the checkpoint, and the encoder if it is another one.
+        """Read the checkpoint, and the encoder if it is a separate checkpoint.
 
         Raises:
             ConfigError: A weight is missing, or the settings do not fit the checkpoint.
@@ -635,7 +642,7 @@ class VJepa2Ac(ModelPolicy):
         """
         saved = read_checkpoint(self.config)
         device = torch_device(self.config.device)
-        # Upstream plans in float32.
+        # Upstream computes plans in float32.
         dtype = torch_dtype(self.config.dtype, device, preferred="float32")
         encoder = load_encoder(self.config, saved.get("encoder"))
         predictor = load_predictor(self.config, saved["predictor"], encoder.config.hidden_size)
@@ -648,10 +655,12 @@ class VJepa2Ac(ModelPolicy):
         )
 
     def notice(self, obs: Obs) -> None:
-        """Set the goal image, if an observation has one; an unchanged image keeps its features.
+        """Set the goal image, if an observation has one.
+
+        If the image is unchanged, its features are kept.
 
         Raises:
-            InvalidObservation: It is no image.
+            InvalidObservation: The goal is not a valid image.
         """
         image = obs.info.get(GOAL_IMAGE)
         if image is None:
@@ -684,7 +693,10 @@ class VJepa2Ac(ModelPolicy):
         return world.staging.stage({_PIXELS: to_pixels(image, self.config.image_size), _POSE: pose})
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        """Plan for all rows that have a goal; the others fail."""
+        """Compute plans for all rows that have a goal.
+
+        The result of a row without a goal is an error.
+        """
         no_goal = InvalidObservation(
             f"info[{GOAL_IMAGE!r}]: expected an image of the goal, (H, W, 3) uint8, got none "
             "since the reset"
@@ -734,7 +746,8 @@ class VJepa2Ac(ModelPolicy):
 
 
 def _openings(actions: np.ndarray, closedness: float) -> np.ndarray:
-    """Return a plan with the opening of the gripper after each step, instead of its change.
+    """Return a plan with the opening of the gripper after each step, instead of the change of its
+    closedness.
 
     Args:
         actions: The plan, (H, 7); the last column is the change of the gripper's closedness.

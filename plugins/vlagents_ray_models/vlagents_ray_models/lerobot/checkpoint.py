@@ -1,5 +1,5 @@
-"""Strict loading of LeRobot checkpoints: missing, unknown or random parameters are errors before
-serving.
+"""Strict loading of LeRobot checkpoints: missing, unknown or randomly initialized parameters are
+errors before serving.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ logger = logging.getLogger(__name__)
 
 WEIGHTS = "model.safetensors"
 TRAINED = "pretrained_model"  # LeRobot's checkpoint folder within the folder of a training step
-# Types that need openpi's changes to transformers in LeRobot 0.4.
+# Policy types that need openpi's changes to transformers in LeRobot 0.4.
 _PATCHED = {"pi0", "pi05", "pi0_fast"}
-_CHECK = "transformers.models.siglip.check"  # a module added by these changes
+_CHECK = "transformers.models.siglip.check"  # a module that these changes add
 
 
 def find(config: LeRobotConfig) -> Path:
@@ -52,7 +52,7 @@ def find(config: LeRobotConfig) -> Path:
         The folder with the policy's config, weights and both processor pipelines.
 
     Raises:
-        ConfigError: There is no such folder, a file is missing, GR00T's own code wrote the
+        ConfigError: The folder does not exist, a file is missing, NVIDIA's own GR00T code wrote the
             checkpoint, or a pipeline names code that is not trusted.
     """
     folder = find_checkpoint(config.checkpoint, config.checkpoint_step)
@@ -95,7 +95,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
     require_served(policy_type, folder)
 
     settings = _read_settings(folder, config)
-    # As in LeRobot's factory; without it EO-1 loads its backbone from the hub.
+    # LeRobot's factory also sets this field. Without it, EO-1 loads its backbone from the hub.
     settings.pretrained_path = folder
     keeps_saved_types = _prepare(settings, config, device)
 
@@ -197,7 +197,8 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
 
     settings.device = str(device)
     if hasattr(settings, "pretrained_backbone_weights"):
-        settings.pretrained_backbone_weights = None  # would be downloaded, only to be replaced
+        # Otherwise downloaded, although it is replaced later.
+        settings.pretrained_backbone_weights = None
 
     sampler = SAMPLERS.get(settings.type, object)
     if issubclass(sampler, (DiffusionSampler, FlowSampler)):  # the types that `compile` supports
@@ -213,7 +214,8 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     _set_dtype(settings, config)
     keeps_saved_types = bool(getattr(settings, "load_vlm_weights", False))
     if keeps_saved_types:
-        settings.load_vlm_weights = False  # would be downloaded in bfloat16, only to be replaced
+        # Otherwise downloaded in bfloat16, although it is replaced later.
+        settings.load_vlm_weights = False
     return keeps_saved_types
 
 
@@ -221,7 +223,8 @@ def _real_time_chunking(settings: Any, config: LeRobotConfig) -> Any:
     """Return LeRobot's settings of real-time chunking, enabled."""
     rtc = settings.rtc_config or require("lerobot.policies.rtc.configuration_rtc").RTCConfig()
     mode: dict[str, str] = {}
-    # LeRobot's own rollouts use guidance by default, also for a checkpoint trained with prefixes.
+    # LeRobot's own rollouts use guidance by default, even for a checkpoint that was trained with
+    # prefixes.
     if getattr(settings, LONGEST_PREFIX, 0):
         overrides = config.overrides.get("rtc_config") or {}
         mode["mode"] = overrides.get("mode", "trained")
@@ -243,13 +246,13 @@ def _set_dtype(settings: Any, config: LeRobotConfig) -> None:
     if has_dtype and config.dtype != "auto":
         settings.dtype = config.dtype
     if config.dtype == "float32" and hasattr(settings, "use_bf16"):
-        settings.use_bf16 = False  # GR00T would otherwise still compute in bfloat16
+        settings.use_bf16 = False  # otherwise GR00T would still compute in bfloat16
 
 
 def _warn_of_float32(settings: Any, config: LeRobotConfig, device: Any) -> None:
     """Warn if `auto` selects float32 on a GPU.
 
-    LeRobot's configs have float32 by default, but its published models do not.
+    The default in LeRobot's configs is float32, but LeRobot's published models use other types.
     """
     if (
         device.type != "cpu"
@@ -258,15 +261,13 @@ def _warn_of_float32(settings: Any, config: LeRobotConfig, device: Any) -> None:
     ):
         logger.warning(
             "dtype: auto is float32 here, as in the checkpoint's config.json: weights take twice "
-            "the memory of bfloat16, and acts at least twice the time; set the policy's dtype: "
+            "the memory of bfloat16, and calls at least twice the time; set the policy's dtype: "
             "bfloat16, or dtype: float32 to keep it"
         )
 
 
 def _with_causes(error: BaseException | None) -> str:
-    """Return the text of an error and of its causes, for example the check of a config that
-    failed.
-    """
+    """Return the text of an error and of its causes, such as a failed check of a config."""
     texts = []
     while error is not None:
         texts.append(f"{type(error).__name__}: {error}")
@@ -289,7 +290,10 @@ def _require_no_nvidia(file: Path) -> None:
 
 
 def _read_config(file: Path) -> Mapping[str, Any]:
-    """Read a config.json, which may be of another library; empty if it is not a JSON object."""
+    """Read a config.json, which may belong to another library.
+
+    The result is empty if the file is not a JSON object.
+    """
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -300,14 +304,14 @@ def _read_config(file: Path) -> Mapping[str, Any]:
 
 
 def _with_current_names(policy: Any, saved: SavedTensors) -> SavedTensors | Mapping[str, Any]:
-    """Return the saved tensors by LeRobot's current names.
+    """Return the saved tensors under LeRobot's current names.
 
-    Checkpoints of openpi and of LeRobot 0.4 have older names.
+    Checkpoints of openpi and of LeRobot 0.4 use older names.
     """
     module = sys.modules[type(policy).__module__]
     saved_names = list(saved)
 
-    # X-VLA's modules, in LeRobot 0.6.
+    # Names of X-VLA's modules in LeRobot 0.6.
     has_older_names = getattr(module, "_is_vendored_florence_state_dict", None)
     if has_older_names is not None and has_older_names(dict.fromkeys(saved_names)):
         tensors = {name: saved[name] for name in saved_names}
@@ -322,7 +326,9 @@ def _with_current_names(policy: Any, saved: SavedTensors) -> SavedTensors | Mapp
 
 
 def _current_names(policy: Any, saved_name: str) -> list[str]:
-    """Return LeRobot's names of a saved tensor; empty if it drops the tensor."""
+    """Return LeRobot's current names of a saved tensor; empty if LeRobot does not use the
+    tensor.
+    """
     rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
     if rename is None:
         return [saved_name]

@@ -1,4 +1,4 @@
-"""Settings of LeRobot policies, in addition to those in the checkpoint."""
+"""Settings of LeRobot policies, in addition to the settings in the checkpoint."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vlagents_ray_models.attention_config import AttentionConfig
 class LeRobotConfig(AttentionConfig):
     """Settings of a policy from a checkpoint of LeRobot.
 
-    The checkpoint is a folder or a hub id with `config.json`, `model.safetensors` and LeRobot's
-    two processor pipelines. It provides the defaults of `actions`, `execute` and `ensemble_m`: from
-    its temporal ensemble, its `n_action_steps`, or a queue if it reads several observations.
-    `dtype: auto` also selects the checkpoint's type.
+    The checkpoint is a folder or a hub id with `config.json`, `model.safetensors` and LeRobot's two
+    processor pipelines. The checkpoint also determines the defaults of `actions`, `execute` and
+    `ensemble_m`, from its temporal ensemble and its `n_action_steps`. If the policy reads several
+    observations, the default of `actions` is "queue". `dtype: auto` selects the checkpoint's type.
     """
 
     overrides: dict[str, Any] = Field(
@@ -53,12 +53,12 @@ class LeRobotConfig(AttentionConfig):
 # Supported version of LeRobot -> the name of its environment for `vlagents-ray venv create`.
 REQUIREMENTS = {"0.4.4": "lerobot", "0.6.1": "lerobot06"}
 
-# Policy type -> why no version of it is served.
+# Policy type -> the reason why no version of it is served.
 _REWARDS = dict.fromkeys(
     ("reward_classifier", "sarm", "robometer", "topreward"), "it returns rewards, not actions"
 )
 
-# Version of LeRobot -> policy type -> why this version of it is not served.
+# Version of LeRobot -> policy type -> the reason why this version's policy is not served.
 _NOT_SERVED = {
     "0.4.4": {
         "groot": "it is GR00T N1.5, whose statistics cannot be checked in LeRobot 0.4.4; serve it "
@@ -66,12 +66,12 @@ _NOT_SERVED = {
         "lerobot06`)"
     },
     "0.6.1": {
-        "lingbot_va": "it goes on from the frames and caches of the chunk before, which it keeps "
-        "for one robot"
+        "lingbot_va": "it continues from the frames and caches of the previous chunk, which it "
+        "stores for one robot only"
     },
 }
 
-# Policy type -> the only version of LeRobot that has it.
+# Policy type -> the only version of LeRobot that supports it.
 _ONLY_IN = {
     "sac": "0.4.4",
     "eo1": "0.6.1",

@@ -1,4 +1,4 @@
-"""LeRobot's policies with their processors, with one forward pass for many sessions."""
+"""LeRobot's policies with their processors. One forward pass serves many sessions."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ from vlagents_ray_models.pi0_passes import Pi0Passes
 log = logging.getLogger(__name__)
 
 ENVIRONMENT = "observation.environment_state"
-JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # default parts of `Obs.state`
+JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # default names of parts of `Obs.state`
 
-# Statistics that tell in which order the parts of a state were concatenated.
+# Statistics from which the order of the concatenated parts of a state is inferred.
 _COMPARED_STATISTICS = ("min", "max", "mean")
-_EMPTY = "empty_camera_"  # prefix of cameras that were always masked in training
+_EMPTY = "empty_camera_"  # prefix of the names of cameras that were always masked in training
 _FLOWS = sorted(
     name for name, sampler in samplers.SAMPLERS.items() if issubclass(sampler, samplers.FlowSampler)
 )
@@ -52,13 +52,14 @@ class LoadedLeRobot:
 
     sampler: samplers.Sampler
     processors: Processors
-    cameras: dict[str, str]  # the policy's observation key -> our name
+    cameras: dict[str, str]  # the policy's observation key -> our camera
     state: list[str]  # parts of the proprioception; empty if the policy has no state
     environment: list[str]  # parts of the environment's state; empty if the policy has none
     contract: Contract
-    trained: DatasetContract  # of the training dataset; empty if the dataset has no contract
-    renames: dict[str, str]  # from the dataset's cameras to the policy's observation keys
-    # Fingerprint of an adapter -> its processors, if it was trained with other statistics.
+    trained: DatasetContract  # contract of the training dataset; empty if the dataset has none
+    renames: dict[str, str]  # the dataset's camera -> the policy's observation key
+    # Fingerprint of an adapter -> the adapter's processors, if it was trained with other
+    # statistics.
     adapter_processors: dict[str, Processors] = field(default_factory=dict)
 
 
@@ -76,7 +77,10 @@ class LeRobot(ModelPolicy):
 
     @property
     def continues_plans(self) -> bool:
-        """Whether a chunk continues the executed plan: that of a flow, with `actions: chunk`."""
+        """Whether a chunk continues the executed plan.
+
+        Chunks of a flow do so with `actions: chunk`.
+        """
         model: LoadedLeRobot | None = self.model
         if model is None or not isinstance(model.sampler, samplers.FlowSampler):
             return False
@@ -84,8 +88,8 @@ class LeRobot(ModelPolicy):
 
     @property
     def longest_prefix(self) -> int:
-        """The most rows of the executed plan with which a chunk begins, if the checkpoint was
-        trained with them and is not guided.
+        """The largest number of rows of the executed plan with which a chunk begins, if the
+        checkpoint was trained with such prefixes and is not guided.
         """
         return int(self.model.sampler.longest) if self.continues_plans else 0
 
@@ -99,11 +103,11 @@ class LeRobot(ModelPolicy):
         return None if feature is None else int(feature.shape[0])
 
     def load(self) -> LoadedLeRobot:
-        """Read the checkpoint, and set the defaults that it provides in `config`.
+        """Read the checkpoint, and set the defaults in `config` that follow from the checkpoint.
 
         Raises:
-            ConfigError: The checkpoint is incomplete or of another version of LeRobot, or a setting
-                does not apply to its type.
+            ConfigError: The checkpoint is incomplete or was written by another version of LeRobot,
+                or a setting does not apply to its type.
         """
         with remote_code(allowed=self.config.trust_remote_code):
             return self._load(checkpoint.find(self.config))
@@ -148,8 +152,9 @@ class LeRobot(ModelPolicy):
             )
         elif self.config.noise_level:
             raise ConfigError(
-                f"noise_level: expected 0 for LeRobot's {policy_type!r}, whose actions come out "
-                f"of no flow, unlike those of {_FLOWS}, got {self.config.noise_level}"
+                f"noise_level: expected 0 for LeRobot's {policy_type!r}, whose actions are not "
+                f"computed with a flow, unlike the actions of {_FLOWS}, got "
+                f"{self.config.noise_level}"
             )
 
     def merge_products(self) -> None:
@@ -170,7 +175,7 @@ class LeRobot(ModelPolicy):
             sampler: The sampler with the loaded policy.
             processors: The processors of the dataset that `trained` describes.
             trained: The contract of the training dataset.
-            renames: From the dataset's cameras to the policy's observation keys.
+            renames: The mapping from the dataset's cameras to the policy's observation keys.
 
         Raises:
             ConfigError: The settings name cameras or parts that do not fit, or the processors lack
@@ -204,11 +209,11 @@ class LeRobot(ModelPolicy):
         )
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Keep the processors saved with an adapter, if any, for the state and the actions of its
-        rows.
+        """Store the processors that were saved with an adapter, if any, for the state and the
+        actions of the adapter's rows.
 
-        If the base does not describe its dataset, as a base of many robots does not, the contract
-        becomes that of the adapter's dataset.
+        If the base does not describe its dataset, such as a base for many robots, the contract of
+        the adapter's dataset is used.
 
         Raises:
             ConfigError: The adapter's processors do not fit the base, or its dataset has another
@@ -243,8 +248,8 @@ class LeRobot(ModelPolicy):
         model.adapter_processors[adapter] = processors
 
     def perceive(self, obs: Obs) -> StagedRow:
-        """Return the images (H, W, 3) uint8 and the state vectors (D,) of an observation, by the
-        policy's observation key.
+        """Return the images, (H, W, 3) uint8, and the state vectors, (D,), of an observation under
+        the policy's observation keys.
         """
         model: LoadedLeRobot = self.model
         images = model_inputs.camera_images(obs, model.cameras)
@@ -258,8 +263,11 @@ class LeRobot(ModelPolicy):
         return model.sampler.staging.stage(inputs)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        """Compute the chunks of rows; rows whose inputs have the same shapes share a pass."""
-        if not self.model.sampler.batched:  # an error fails only its session
+        """Compute the chunks of rows.
+
+        Rows whose inputs have the same shapes share a forward pass.
+        """
+        if not self.model.sampler.batched:  # an error affects only its own session
             return [attempt(lambda row: self._draw([row])[0], row) for row in rows]
 
         by_shapes: dict[Any, list[int]] = {}
@@ -283,7 +291,7 @@ class LeRobot(ModelPolicy):
             processors = model.adapter_processors.get(row.adapter, model.processors)
             leftovers.append(processors.leftover(row))
 
-        # As in LeRobot's own loop.
+        # LeRobot's own loop does the same.
         mixed_precision = settings.use_amp and torch.device(settings.device).type == "cuda"
         with torch.inference_mode(), torch.autocast("cuda", enabled=mixed_precision):
             observed = [rows[i] for i in sampler.observed_rows(rows)]
@@ -314,7 +322,7 @@ class LeRobot(ModelPolicy):
 
 
 def _rows_of(adapter: str, rows: Sequence[Row]) -> list[int]:
-    """Return the indices of the rows of an adapter, which its fingerprint identifies."""
+    """Return the indices of the rows that use the adapter with this fingerprint."""
     return [i for i, row in enumerate(rows) if row.adapter == adapter]
 
 
@@ -324,9 +332,11 @@ def _with_defaults(config: LeRobotConfig, sampler: samplers.Sampler) -> LeRobotC
     defaults: dict[str, Any] = {}
     if config.actions != "ensemble":
         defaults["execute"] = sampler.default_execute
-    if sampler.steps > 1:  # trained on consecutive frames, so it also needs those within a chunk
+    # The policy was trained on consecutive frames, so it also needs the frames within a chunk.
+    if sampler.steps > 1:
         defaults["actions"] = "queue"
-    if coefficient is not None:  # its n_action_steps is 1, since LeRobot then runs it at every tick
+    # n_action_steps is 1 in this case, since LeRobot runs the policy at every tick.
+    if coefficient is not None:
         defaults = {"actions": "ensemble", "ensemble_m": coefficient, "execute": None}
 
     if (config.execute or 0) > sampler.horizon:
@@ -345,7 +355,8 @@ def _is_set(config: LeRobotConfig, name: str) -> bool:
 def _ranges(model: LoadedLeRobot) -> dict[str, Any] | None:
     """Return `HasStatistics.statistics`, the ranges of the state and the actions in training.
 
-    The state is left out if its angles are wrapped, and the actions if they are relative to it.
+    The state is omitted if its angles are wrapped, and the actions are omitted if they are relative
+    to the state.
     """
     comparable = []
     if not model.trained.angles:
@@ -364,15 +375,15 @@ def _ranges(model: LoadedLeRobot) -> dict[str, Any] | None:
 
 
 def _is_finite(values: Sequence[float] | None) -> bool:
-    """Return whether there are values, all of them finite."""
+    """Return whether there are values and all of them are finite."""
     return bool(values) and bool(np.isfinite(values).all())  # type: ignore[arg-type]
 
 
 def _training_dataset(settings: Any, processors: Processors) -> DatasetContract:
     """Return the contract of the checkpoint's dataset.
 
-    If the dataset has none, it is inferred from its features; it is empty if that is not possible,
-    or if the contract does not fit the policy.
+    If the dataset has no contract, it is inferred from the dataset's features. The result is empty
+    if the contract cannot be inferred, or does not fit the policy.
     """
     state_feature, dataset = settings.robot_state_feature, processors.dataset()
     if dataset is None:
@@ -383,8 +394,8 @@ def _training_dataset(settings: Any, processors: Processors) -> DatasetContract:
     if state_feature is None or dataset.width == state_feature.shape[0]:
         return dataset
     log.warning(
-        "the contract of the checkpoint's dataset has %d numbers of state, the policy takes %d: it "
-        "is not used; set `state` to the parts that the policy was trained with",
+        "the contract of the checkpoint's dataset has %d numbers of state, the policy accepts %d: "
+        "the contract is not used; set `state` to the parts that the policy was trained with",
         dataset.width,
         state_feature.shape[0],
     )
@@ -394,9 +405,9 @@ def _training_dataset(settings: Any, processors: Processors) -> DatasetContract:
 def _infer_from_features(features: Iterable[str], processors: Processors) -> DatasetContract:
     """Infer the parts of the state, and its angles, from features and their statistics.
 
-    Copies that LeRobot's tools make without some episodes have no contract. The parts are the
-    features other than `observation.state`; their order follows from comparing their statistics
-    with the statistics of `observation.state`.
+    Datasets that LeRobot's tools copy without some episodes have no contract. The parts are the
+    features other than `observation.state`. Their order is found by comparing their statistics with
+    the statistics of `observation.state`.
 
     Args:
         features: The keys of the dataset's features, in their order.
@@ -422,7 +433,7 @@ def _infer_from_features(features: Iterable[str], processors: Processors) -> Dat
         return DatasetContract(Contract())
 
     angles: dict[int, Centre] = {}
-    first = 0  # the index of a part's first value in the state
+    first = 0  # index of the part's first value in the state
     for name in order:
         width = len(part_statistics[name]["mean"])
         for i in angles_in(name, usual_unit(name), width):
@@ -439,7 +450,9 @@ def _fits(
     part_statistics: Mapping[str, Mapping[str, list[float]]],
     state_statistics: Mapping[str, list[float]],
 ) -> bool:
-    """Return whether parts in this order have, one after another, the statistics of the state."""
+    """Return whether the concatenated statistics of the parts, in this order, equal the
+    statistics of the state.
+    """
     for statistic in _COMPARED_STATISTICS:
         joined = np.concatenate([part_statistics[name].get(statistic, []) for name in order])
         expected = state_statistics.get(statistic, [])
@@ -453,17 +466,19 @@ def _fits(
 def _cameras(
     settings: Any, config: LeRobotConfig, renames: dict[str, str], trained: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the policy's observation key of each camera that is not masked -> our name.
+    """Return a mapping from the policy's observation key of each camera that is not masked to our
+    camera.
 
     Args:
         settings: LeRobot's config object of the policy.
         config: The settings of the deployment.
-        renames: From the dataset's cameras to the policy's observation keys.
-        trained: The dataset's camera features -> our names, as far as its contract has them.
+        renames: The mapping from the dataset's cameras to the policy's observation keys.
+        trained: The mapping from the dataset's camera features to our cameras, as far as the
+            dataset's contract contains them.
 
     Raises:
         ConfigError: `cameras` or `masked_cameras` names cameras that the policy does not have, or
-            the policy cannot mask any.
+            the policy cannot mask cameras.
     """
     name_of = {key: _short(key) for key in settings.image_features if _EMPTY not in key}
     known = sorted(name_of.values())
@@ -481,19 +496,23 @@ def _cameras(
     sources = {renamed: source for source, renamed in renames.items()}
     defaults = {}
     for key, name in used.items():
-        feature = sources.get(key, key)  # the dataset's key
+        feature = sources.get(key, key)  # key of the camera in the dataset
         defaults[name] = trained.get(feature, _short(feature))
     chosen = model_inputs.choose_cameras(config.cameras, defaults, list(used.values()))
     return {key: chosen[name] for key, name in used.items()}
 
 
 def _short(key: str) -> str:
-    """Return the name of a camera in its observation key."""
+    """Return the part of an observation key that is the camera's name."""
     return key.removeprefix("observation.images.").removeprefix("observation.")
 
 
 def _camera(settings: Any, key: str) -> CameraSpec:
-    """Specify a camera: of any size if the policy resizes images, else of the size in training."""
+    """Specify a camera.
+
+    Its images may have any size if the policy resizes them; otherwise they must have the size used
+    in training.
+    """
     if (
         settings.type in samplers.RESIZING
         or getattr(settings, "resize_imgs_with_padding", None) is not None
@@ -506,8 +525,9 @@ def _camera(settings: Any, key: str) -> CameraSpec:
 def _state_specs(
     settings: Any, state: Sequence[str], environment: Sequence[str], trained: DatasetContract
 ) -> dict[str, StateSpec]:
-    """Specify the parts of the state and of the environment's state, as the training dataset does
-    if it has the same parts.
+    """Specify the parts of the state and of the environment's state.
+
+    If the training dataset has the same parts, its specification is used.
     """
     known = trained.contract.state or {}
     specs: dict[str, StateSpec] = {}
@@ -523,8 +543,10 @@ def _state_specs(
 
 
 def _action_spec(settings: Any, width: int, trained: DatasetContract) -> ActionSpec:
-    """Specify an action of `width` numbers, as the training dataset does if its actions have that
-    many.
+    """Specify an action of `width` numbers.
+
+    If the actions of the training dataset have the same number of values, its specification is
+    used.
     """
     action = trained.contract.action
     if action.dim != width:

@@ -36,17 +36,19 @@ _TOKENIZER = "tokenizer_processor"
 _GROOT_TOKENIZER = "groot_n1_7_vlm_encode_v1"
 _NORMALIZERS = ("normalizer_processor", "unnormalizer_processor")
 _ABSOLUTE = (
-    "AbsoluteActionsProcessorStep"  # class in LeRobot 0.6: adds the state to relative actions
+    "AbsoluteActionsProcessorStep"  # class in LeRobot 0.6 that adds the state to relative actions
 )
 
-_NAME = "tokenizer_name"  # a hub id, or a folder on the machine where the policy was trained
+# Setting with a hub id, or with a folder on the machine where the policy was trained.
+_NAME = "tokenizer_name"
 
-# Types whose prompts contain the state, so that they differ at each call.
+# Policy types whose prompts contain the state and therefore differ in each call.
 _STATE_IN_PROMPT = ("pi05", "pi0_fast")
-# Types that tokenize outside the pre-processor.
+# Policy types that tokenize outside of the pre-processor.
 _TOKENIZING = ("eo1", "evo1", "fastwam", "molmoact2", "vla_jepa", "wall_x")
 
-# Settings of a policy, apart from its cameras, that change the network for the same weights.
+# Settings of a policy, apart from its cameras, that change the network although the weights are the
+# same.
 _NETWORK = (
     "type",
     "n_obs_steps",
@@ -99,7 +101,7 @@ class Processors:
                 f"got {unknown}; correct the names"
             )
 
-        self.steps = [list(before), list(after)]  # the registered names, for both pipelines
+        self.steps = [list(before), list(after)]  # registered names of both pipelines
         self.step_settings = _comparable_settings(before, config)
         self.step_settings.update(_comparable_settings(after, config))
 
@@ -112,7 +114,7 @@ class Processors:
 
         before_overrides = {
             _DEVICE: {"device": settings.device},
-            _RENAME: {"rename_map": {}},  # `perceive` uses the policy's names
+            _RENAME: {"rename_map": {}},  # `perceive` already uses the policy's names
             **config.processors,
         }
         try:
@@ -124,7 +126,7 @@ class Processors:
                 postprocessor_overrides=_of_steps(config.processors, after),
             )
             for step in self._before.steps:
-                getattr(step, "proc", None)  # GR00T's loads its tokenizer on first use
+                getattr(step, "proc", None)  # GR00T's step loads its tokenizer on first use
         except Exception as error:
             raise ConfigError(
                 f"checkpoint {folder}: its processors do not load ({type(error).__name__}: "
@@ -141,15 +143,15 @@ class Processors:
         absolute = [
             step for step in self._after.steps if type(step).__name__ == _ABSOLUTE and step.enabled
         ]
-        # Stores the states of the last batch.
+        # The step that stores the states of the last batch.
         self._relative = absolute[0].relative_step if absolute else None
-        # Whether actions are converted by whole chunks instead of rows.
+        # Whether actions are converted as whole chunks instead of single rows.
         self.whole = self._is_groot or bool(absolute)
         self.inverse = self._make_inverse()
 
     def statistics(self, key: str) -> dict[str, list[float]]:
-        """Return the statistics of a feature of the dataset, such as "mean"; empty if there are
-        none.
+        """Return the statistics of a feature of the dataset by name, such as "mean"; empty if there
+        are none.
         """
         for step in self._before.steps:
             by_feature = getattr(step, "_tensor_stats", None) or getattr(step, "stats", None) or {}
@@ -202,7 +204,7 @@ class Processors:
             steps: The number of observations of each row, from the newest backwards.
 
         Returns:
-            Tensors (B * steps, …) on the policy's device, by the policy's observation key.
+            Tensors (B * steps, …) on the policy's device, under the policy's observation keys.
         """
         frames: list[Any] = []
         instructions: list[str] = []
@@ -212,7 +214,7 @@ class Processors:
 
         batch = self.staging.stack(frames, keep=steps > 1)
         for key, values in batch.items():
-            if values.ndim == 4:  # images: (…, H, W, 3) uint8 to (…, 3, H, W) in [0, 1]
+            if values.ndim == 4:  # convert images, (…, H, W, 3) uint8 -> (…, 3, H, W) in [0, 1]
                 batch[key] = values.permute(0, 3, 1, 2).float() / 255
         batch["task"] = instructions
         return {key: value for key, value in self._before(batch).items() if value is not None}
@@ -227,7 +229,7 @@ class Processors:
         """Convert the policy's actions (B, T, D) to (B, T, D') float32, in the robot's units."""
         if self.whole:
             return fetch(self._after(chunks.float()).float())
-        flat = self._after(chunks.float().flatten(0, 1))  # rows, as in LeRobot's own loop
+        flat = self._after(chunks.float().flatten(0, 1))  # single rows, as in LeRobot's own loop
         return fetch(flat.unflatten(0, chunks.shape[:2]).float())
 
     def leftover(self, row: Row) -> Any:
@@ -255,7 +257,7 @@ class Processors:
         return int(self._after(require("torch").zeros(1, dim)).shape[-1])
 
     def _keep_tokens(self) -> None:
-        """Cache the tokens of instructions, if they do not depend on the other rows of a batch."""
+        """Cache the tokens of instructions if they do not depend on other rows of the batch."""
         tokenizer_class = require("lerobot.processor").TokenizerProcessorStep
         for step in self._before.steps:
             if type(step) is tokenizer_class and step.padding == "max_length":
@@ -268,7 +270,9 @@ class Processors:
                 )
 
     def _make_inverse(self) -> Any:
-        """Return the inverse of the post-processor; None if it does more than unnormalise."""
+        """Return the inverse of the post-processor; None if the post-processor does more than
+        unnormalise.
+        """
         processor = require("lerobot.processor")
         converters = require("lerobot.processor.converters")
 
@@ -295,17 +299,18 @@ class Processors:
 
 
 def _of_steps(overrides: Mapping[str, Any], steps: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the overrides of those steps that a pipeline has."""
+    """Return the overrides for the steps that a pipeline contains."""
     return {name: settings for name, settings in overrides.items() if name in steps}
 
 
 def _comparable_settings(
     steps: Mapping[str, Mapping[str, Any]], config: LeRobotConfig
 ) -> dict[str, dict[str, Any]]:
-    """Return the settings of the steps that depend neither on the dataset nor on the machine.
+    """Return the settings of the steps, without settings that depend on the dataset or on the
+    machine.
 
-    Settings that the deployment overrides are left out, as are those of the steps that move, rename
-    or normalise.
+    Settings that the deployment overrides are omitted, and so are the settings of steps that move,
+    rename or normalise values.
     """
     comparable: dict[str, dict[str, Any]] = {}
     for name, settings in steps.items():
@@ -354,8 +359,9 @@ def _require_feature_statistics(pipeline: Any, key: str, settings: Any, file: st
 def adapter_processors(
     folder: Path, settings: Any, config: LeRobotConfig, base: Processors
 ) -> Processors | None:
-    """Return the processors saved with an adapter, whose dataset may have other statistics than the
-    dataset of the base.
+    """Return the processors that were saved with an adapter.
+
+    The adapter's dataset may have other statistics than the dataset of the base.
 
     Args:
         folder: The adapter's folder.
@@ -364,11 +370,12 @@ def adapter_processors(
         base: The processors of the base.
 
     Returns:
-        The processors; None if there are none, so that the base's are used.
+        The processors; None if the adapter has none, in which case the processors of the base are
+        used.
 
     Raises:
-        ConfigError: They differ from the base's in more than the statistics of state and actions,
-            or the policy's config in the same folder describes another network.
+        ConfigError: The processors differ from the base's processors in more than the statistics of
+            state and actions, or the policy's config in the same folder describes another network.
     """
     _require_same_network(folder / _CONFIG, settings, config)
     missing = [name for name in PIPELINES if not (folder / name).is_file()]
@@ -401,7 +408,8 @@ def adapter_processors(
 def _differences(
     processors: Processors, base: Processors, settings: Any, allowed: set[str]
 ) -> list[str]:
-    """Return what distinguishes an adapter's processors from the base's, for an error message.
+    """Return the differences between an adapter's processors and the base's processors, for an
+    error message.
 
     Statistics of the features in `allowed` may differ.
     """
@@ -482,7 +490,7 @@ def require_known_steps(file: Path) -> None:
         file: The JSON file of the pipeline.
 
     Raises:
-        ConfigError: A step is some other class.
+        ConfigError: A step is any other class.
     """
     steps = json.loads(file.read_text(encoding="utf-8")).get("steps", [])
     for step in steps:
@@ -495,7 +503,7 @@ def require_known_steps(file: Path) -> None:
 
 
 def _is_lerobots(path: object) -> bool:
-    """Return whether a dotted path names a processor step in LeRobot."""
+    """Return whether a dotted path refers to a processor step in LeRobot."""
     module, _, class_name = str(path).rpartition(".")
     if not module.startswith("lerobot."):
         return False
@@ -507,7 +515,9 @@ def _is_lerobots(path: object) -> bool:
 
 
 def _saved_steps(file: Path) -> dict[str, Mapping[str, Any]]:
-    """Return the settings of each step of a pipeline, by the step's registered name."""
+    """Return a mapping from the registered name of each step of a pipeline to the step's
+    settings.
+    """
     steps = json.loads(file.read_text(encoding="utf-8")).get("steps", [])
     settings = {}
     for step in steps:
@@ -519,14 +529,14 @@ def _saved_steps(file: Path) -> dict[str, Mapping[str, Any]]:
 def cached_tokenizer(
     tokenizer: Any, device: Any, **settings: Any
 ) -> Callable[[list[str]], dict[str, Any]]:
-    """Return a cached function from texts to a tokenizer's tensors (B, L) on a device.
+    """Return a cached function that converts texts to a tokenizer's tensors, (B, L), on a device.
 
-    All texts are padded to one length; otherwise a row, padded to the longest text of its batch,
-    would depend on the other rows.
+    All texts are padded to the same length. Otherwise, a row would be padded to the longest text of
+    its batch, and would depend on the other rows.
 
     Args:
         tokenizer: A tokenizer of transformers.
-        device: The device of the tensors; the cache stores them there.
+        device: The device of the tensors and of the cache.
         settings: Further arguments of the tokenizer's calls, such as `max_length`.
     """
 

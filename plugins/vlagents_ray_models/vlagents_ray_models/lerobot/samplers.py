@@ -1,7 +1,8 @@
-"""The types of LeRobot's policies, and how each computes the chunks of many sessions.
+"""The samplers of LeRobot's policy types, which compute the chunks of many sessions.
 
-LeRobot's `select_action` stores observations, actions and plans in the policy object, for one
-robot. The classes here call its stateless functions, and pass them the state of each session.
+LeRobot's `select_action` stores observations, actions and plans of a single robot in the policy
+object. The classes here call the policy's stateless functions, and pass the state of each session
+to them.
 """
 
 from __future__ import annotations
@@ -27,36 +28,38 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.key_value_cache import cache_of, layers_of, stack_of
 from vlagents_ray_models.pi0_passes import Pi0Passes
 
-# A field of the configs of LeRobot after 0.6.1, for π0.5; 0: trained without prefixes.
+# A field of π0.5's config in LeRobot after 0.6.1. It is 0 if the policy was trained without
+# prefixes.
 LONGEST_PREFIX = "rtc_training_max_delay"
 # Fields of π0.5's config in the same versions.
 _MEMORIES = ("use_visual_memory", "use_proprioceptive_memory")
 
 # Keys of LeRobot's observations and actions.
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images"
-FRAMES = (STATE, "observation.environment_state", IMAGES)  # inputs of each step of a history
+FRAMES = (STATE, "observation.environment_state", IMAGES)  # keys of the inputs that have a history
 _TOKENS = ("observation.language.tokens", "observation.language.attention_mask")
 
 
 class Sampler:
-    """Computes the chunks of a policy; this base class serves any type.
+    """Computes the chunks of a policy.
 
-    It runs one row at a time with a seed from the row's session, which is slow but exact.
+    This base class supports any policy type. It computes one row at a time with a seed from the
+    row's session, which is slow but exact.
     """
 
     batched = False  # whether `draw` accepts several rows
-    # Fields of the config with the number of rows of a chunk, by preference.
+    # Fields of the config that may contain the number of rows of a chunk, in order of preference.
     lengths: ClassVar[tuple[str, ...]] = ("chunk_size", "n_action_steps")
     random_steps: RandomSteps | None = None  # random steps of the last call of `draw`
-    # In the last call of `draw`: index of a row -> the number of its chunk's first rows that were
-    # an input, because they are already planned.
+    # For the last call of `draw`: index of a row -> number of rows at the beginning of its chunk
+    # that were inputs, since they were already planned.
     prefix_rows: Mapping[int, int] = {}
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         """Use a loaded policy, and compile its core functions if its type supports that.
 
         Raises:
-            ConfigError: The policy object stores what belongs to a session.
+            ConfigError: The policy object stores the state of a session.
         """
         self.policy, self.config = policy, policy.config
         self.staging = Staging(policy.config.device)
@@ -119,7 +122,9 @@ class Sampler:
 
 
 def row_draws(rows: Sequence[Row], *models: Any) -> AbstractContextManager[object]:
-    """Return the context in which models draw each row's numbers from that row's generator."""
+    """Return the context in which models draw random numbers for each row from the row's own
+    generator.
+    """
     from vlagents_ray_models.sampling_rng import RowDraws  # imports torch
 
     return RowDraws([row.rng for row in rows], *models)
@@ -162,7 +167,8 @@ class DiffusionSampler(Sampler):
         denoise = compilation.core("denoise", unet.forward)
         self._encode = compilation.core("vision encoder", self._condition)
 
-        # LeRobot passes `global_cond` by name, a compiled core takes its arguments by position.
+        # LeRobot passes `global_cond` as a keyword argument, but a compiled core accepts only
+        # positional arguments.
         def forward(sample: Any, times: Any, global_cond: Any) -> Any:
             return denoise(sample, times, global_cond)
 
@@ -196,8 +202,8 @@ class DiffusionSampler(Sampler):
 
 
 class MultiTaskDitSampler(Sampler):
-    """The multi-task diffusion transformer of LeRobot 0.6, which reads an instruction; it denoises
-    by diffusion or flow matching.
+    """The multi-task diffusion transformer of LeRobot 0.6, which reads an instruction and uses
+    diffusion or flow matching.
     """
 
     batched = True
@@ -209,12 +215,12 @@ class MultiTaskDitSampler(Sampler):
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         observations = stacked(batch, self.config, len(rows))
         for name in _TOKENS:
-            # They are the same in each step of a history.
+            # The tokens are the same in each step of a history.
             observations[name] = batch[name].unflatten(0, (len(rows), -1))[:, -1]
 
         condition = self.policy.observation_encoder.encode(observations)
         objective = self.policy.objective
-        # The steps of DDPM draw in diffusers' module.
+        # The steps of DDPM draw noise in a module of diffusers.
         with row_draws(rows, objective, require("diffusers.utils.torch_utils")):
             actions = objective.conditional_sample(
                 self.policy.noise_predictor, len(rows), condition
@@ -223,10 +229,11 @@ class MultiTaskDitSampler(Sampler):
 
 
 class FlowSampler(Sampler):
-    """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers.
+    """The sampler of SmolVLA, π0 and π0.5.
 
-    A checkpoint that was trained with prefixes reads the first rows of a leftover as an input
-    instead, and is not guided.
+    These policies use flow matching from the sessions' noise, guided by their leftover plans. A
+    checkpoint that was trained with prefixes is not guided. It reads the first rows of a leftover
+    plan as an input.
     """
 
     batched = True
@@ -249,10 +256,12 @@ class FlowSampler(Sampler):
                 "keeps, so that sessions would mix"
             )
 
-        # The policy calls it after preparing the inputs and before converting the actions.
+        # The policy calls this function after preparing the inputs and before converting the
+        # actions.
         model.sample_actions = self.passes.sample
         has_prefixes = getattr(policy.rtc_processor.rtc_config, "mode", "guided") == "trained"
-        self.longest = int(getattr(config, LONGEST_PREFIX)) if has_prefixes else 0  # rows
+        # Longest prefix, rows.
+        self.longest = int(getattr(config, LONGEST_PREFIX)) if has_prefixes else 0
         self.passes.by_row = has_prefixes
 
     def observed_rows(self, rows: Sequence[Row]) -> list[int]:
@@ -261,7 +270,8 @@ class FlowSampler(Sampler):
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         shape = (self.horizon, int(self.config.max_action_dim))
         upload = self.staging.upload
-        # This noise is drawn before the noise of the steps, which only some rows draw.
+        # This noise is drawn before the noise of the steps, which is drawn for only some of the
+        # rows.
         noise = upload(np.stack([row.noise(*shape) for row in rows]))
         self.random_steps = RandomSteps.for_rows(
             rows, (self.flow_steps, *shape), self.noise_level, upload
@@ -307,21 +317,24 @@ class FlowSampler(Sampler):
         """Return the rows whose observations are read, and for each row the index of its
         observations among them.
         """
-        # Each row's state is added to its actions.
+        # With relative actions, the state of each row is added to the row's actions.
         if getattr(self.config, "use_relative_actions", False):
             return list(range(len(rows))), list(range(len(rows)))
         return shared_frames(rows)
 
     def _prefixed(self, row: Row, plan: Any) -> Row:
-        """Return the row with its plan in the policy's units, and with a delay that is the number
-        of the plan's rows that the policy reads.
+        """Return the row with its plan in the policy's units.
+
+        Its delay is set to the number of rows of the plan that the policy reads.
         """
-        # Before the first answer its delay is unknown.
+        # Before the first answer, the delay is unknown.
         delay = min(row.delay or self.longest, self.longest)
         return replace(row, leftover=None if plan is None else fetch(plan), delay=delay)
 
     def _encoded(self, leftover: Any) -> Any:
-        """Convert a leftover to the units of π0's ALOHA, if SmolVLA was trained in these."""
+        """Convert a leftover plan to the units of π0's ALOHA, if SmolVLA was trained in these
+        units.
+        """
         if not getattr(self.config, "adapt_to_pi_aloha", False):
             return leftover
         return self.policy._pi_aloha_encode_actions_inv(leftover[None].clone())[0]
@@ -334,15 +347,16 @@ def guided(
     shape: tuple[int, int],
     convert: Any,
 ) -> Change:
-    """Return the change of velocities that leads chunks to the leftovers of their sessions, as
-    LeRobot does.
+    """Return the change of velocities that guides chunks towards the leftover plans of their
+    sessions, as LeRobot does.
 
     Args:
         processor: The policy's `RTCProcessor`, for its settings and its schedule.
-        plans: The leftover of each of the B rows in the policy's units, (H', D'), or None.
-        delays: For each row, the number of actions that will have been executed.
-        shape: Rows and numbers of a chunk, (H, D).
-        convert: Makes a tensor of an array, on the policy's device.
+        plans: The leftover plan of each of the B rows in the policy's units, (H', D'), or None.
+        delays: The number of actions of each row that will have been executed when the chunk
+            arrives.
+        shape: The number of rows of a chunk and of values of a row, (H, D).
+        convert: A function that converts an array to a tensor on the policy's device.
     """
     torch, settings = require("torch"), processor.rtc_config
     rows, dim = shape
@@ -372,16 +386,16 @@ def guided(
 
 
 class SmolVLAPasses(FlowPasses):
-    """The passes of SmolVLA, whose images are encoded from their patches."""
+    """The forward passes of SmolVLA, which encode images from their patches."""
 
     def __init__(self, model: Any, compilation: Compilation) -> None:
-        """Use the passes of a `VLAFlowMatching`, which then also accepts patches in place of
+        """Use the forward passes of a `VLAFlowMatching`, which then also accepts patches instead of
         images.
         """
         super().__init__(model, compilation)
         self._vlm = model.vlm_with_expert.get_vlm_model()
-        # LeRobot 0.4 stores keys and values by name, (B, L, heads, D); later versions in a cache of
-        # transformers.
+        # LeRobot 0.4 stores keys and values by name, (B, L, heads, D). Later versions store them in
+        # a cache of transformers.
         parameters = inspect.signature(model.vlm_with_expert.forward).parameters
         self._by_name = "fill_kv_cache" in parameters
         # Height and width of an image -> the positions of its patches, (L,).
@@ -435,7 +449,7 @@ class SmolVLAPasses(FlowPasses):
         )
 
     def _embed(self, patches: Any) -> Any:
-        if patches.ndim == 4:  # an image, in LeRobot's own training pass
+        if patches.ndim == 4:  # the input is an image in LeRobot's own training pass
             return self._embed_image(patches)
         vision = self._vlm.vision_model
         hidden = vision.encoder(inputs_embeds=patches, attention_mask=None).last_hidden_state
@@ -452,7 +466,7 @@ class SmolVLAPasses(FlowPasses):
             hook = vision.embeddings.position_embedding.register_forward_pre_hook(
                 lambda _, inputs: captured.extend(inputs)
             )
-            with hook, self.adapters.rows(()):  # the image belongs to no row
+            with hook, self.adapters.rows(()):  # no adapter, since the image belongs to no row
                 patches = [length // vision.patch_size for length in size]
                 mask = torch.ones(1, *patches, dtype=torch.bool, device=image.device)
                 vision.embeddings(image[:1].to(vision.dtype), mask)
@@ -499,7 +513,7 @@ class GrootSampler(Sampler):
 def _select_rows(
     batch: Mapping[str, Any], indices: Sequence[int], length: int, rows: int
 ) -> dict[str, Any]:
-    """Return GR00T's inputs of some rows, without the padding before their prompts.
+    """Return GR00T's inputs for the selected rows, without the padding before their prompts.
 
     Args:
         batch: The inputs of all rows.
@@ -507,8 +521,9 @@ def _select_rows(
         length: The number of tokens in the prompts of these rows.
         rows: The number of all rows.
     """
-    grid = batch["image_grid_thw"]  # (rows * views, 3): patches of each image in time and space
-    patches = batch["pixel_values"].split(grid.prod(1).tolist())  # one tensor for each image
+    # Number of patches of each image in time and space, (rows * views, 3).
+    grid = batch["image_grid_thw"]
+    patches = batch["pixel_values"].split(grid.prod(1).tolist())  # a tensor for each image
     views = len(grid) // rows
     images: list[int] = []
     for i in indices:
@@ -528,7 +543,9 @@ def _select_rows(
 
 
 def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settings: Any) -> None:
-    """Check that GR00T's processors have usable bounds; LeRobot replaces missing ones with 0 and 1.
+    """Check that GR00T's processors have usable bounds.
+
+    LeRobot would replace missing bounds with 0 and 1.
 
     Args:
         before: The steps of the pre-processor.
@@ -577,7 +594,7 @@ def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settin
 
 
 def groot_dataset(before: Sequence[Any]) -> DatasetContract | None:
-    """Return the parts of the state that NVIDIA's checkpoint names.
+    """Return the parts of the state that NVIDIA's checkpoint contains.
 
     Args:
         before: The steps of the pre-processor.
@@ -604,7 +621,7 @@ def _find_step(steps: Sequence[Any], attribute: str) -> Any:
 
 
 class ActSampler(Sampler):
-    """ACT, whose latent is zero at inference, so that nothing is random."""
+    """The sampler of ACT, whose latent is zero at inference, so that actions are deterministic."""
 
     batched = True
 
@@ -626,13 +643,13 @@ class ActSampler(Sampler):
 
 
 class FastSampler(Sampler):
-    """π0-FAST, which decodes only the tokens of rows that are executed."""
+    """The sampler of π0-FAST, which decodes only the tokens of rows that are executed."""
 
     lengths = ("n_action_steps",)
 
 
 class Evo1Sampler(Sampler):
-    """EVO-1, whose post-processor removes the padding of actions."""
+    """The sampler of EVO-1, whose post-processor removes the padding of actions."""
 
     @property
     def dim(self) -> int:
@@ -640,8 +657,10 @@ class Evo1Sampler(Sampler):
 
 
 class XVlaSampler(Sampler):
-    """X-VLA, which draws its noise itself and does not mask padding, so a batch needs
-    instructions of one length.
+    """The sampler of X-VLA.
+
+    X-VLA draws its noise itself and does not mask padding, so all instructions of a batch must have
+    the same length.
     """
 
     @property
@@ -666,8 +685,10 @@ class XVlaSampler(Sampler):
 
 
 class VqBetSampler(Sampler):
-    """VQ-BeT, which samples the codes of its residual VQ; checkpoints of its first training
-    phase have no codes.
+    """The sampler of VQ-BeT.
+
+    VQ-BeT samples the codes of its residual VQ. Checkpoints of its first training phase have no
+    codes.
     """
 
     batched = True
@@ -687,10 +708,11 @@ class VqBetSampler(Sampler):
 
 
 class TdmpcSampler(Sampler):
-    """TD-MPC, which runs one row at a time, since the rows of a batch would share random
-    trajectories and Q functions.
+    """The sampler of TD-MPC.
 
-    The plan of a session's last tick, from which the next one starts, is in `row.memory`.
+    It computes one row at a time, since the rows of a batch would share random trajectories and Q
+    functions. `row.memory` contains the plan of the session's last tick, from which the next plan
+    starts.
     """
 
     @property
@@ -723,8 +745,9 @@ class TdmpcSampler(Sampler):
 
 
 class SacSampler(Sampler):
-    """SAC, which LeRobot 0.6 calls `gaussian_actor`, with single actions and no state between
-    them.
+    """The sampler of SAC, which LeRobot 0.6 calls `gaussian_actor`.
+
+    SAC returns single actions, and keeps no state between them.
     """
 
     @property
@@ -733,21 +756,21 @@ class SacSampler(Sampler):
 
     @property
     def dim(self) -> int:
-        # The gripper's choice, which comes last.
+        # The discrete action of the gripper is the last value.
         return super().dim + (self.config.num_discrete_actions is not None)
 
     def _draw_one(self, batch: dict[str, Any], row: Row) -> Any:
-        # The gripper's network accepts no other inputs.
+        # The network of the gripper accepts no other inputs.
         inputs = {key: batch[key] for key in self.config.input_features}
         return self.policy.select_action(inputs)[:, None]
 
 
-# Types that resize images themselves.
+# Policy types that resize images themselves.
 RESIZING = {"groot", "smolvla", "pi0", "pi05", "pi0_fast", "wall_x"}
-# Types that mask missing cameras.
+# Policy types that mask missing cameras.
 MASKING = {"smolvla", "pi0", "pi05", "pi0_fast", "xvla"}
 
-# Policy type -> its sampler; `Sampler` itself serves all other types.
+# Policy type -> its sampler. `Sampler` itself supports all other types.
 SAMPLERS: Mapping[str, type[Sampler]] = {
     "act": ActSampler,
     "diffusion": DiffusionSampler,

@@ -31,10 +31,10 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.openvla import prismatic
 
 _PRIMARY = "full_image"
-# The cameras in the order of training.
+# The cameras, in the order of training.
 _CAMERAS = (_PRIMARY, "wrist_image", "left_wrist_image", "right_wrist_image")
-# Defaults for LIBERO: the model's name of each camera -> ours, and the parts of the state, which
-# have 6 and 2 numbers.
+# The defaults for LIBERO: the model's name of each camera -> our camera, and the parts of the
+# state, which have 6 and 2 numbers.
 _DEFAULT_CAMERAS = {_PRIMARY: "front", "wrist_image": "wrist"}
 _DEFAULT_STATE = ("xyz_axis_angle", "gripper_qpos")
 
@@ -42,7 +42,8 @@ _DEFAULT_STATE = ("xyz_axis_angle", "gripper_qpos")
 class OpenVLAOFTConfig(prismatic.PrismaticConfig):
     """Settings of OpenVLA-OFT.
 
-    They must describe how a checkpoint was trained, since its files do not.
+    They must describe how a checkpoint was trained, since the checkpoint's files do not contain
+    this.
     """
 
     attention: Literal["sdpa", "eager"] = Field(
@@ -81,7 +82,7 @@ class OpenVLAOFTConfig(prismatic.PrismaticConfig):
 
 
 class OpenVLAOFT(prismatic.PrismaticPolicy):
-    """The policy OpenVLA-OFT, which returns a chunk for each `act`."""
+    """The policy OpenVLA-OFT, which returns a chunk for each call."""
 
     Config = OpenVLAOFTConfig
     config: OpenVLAOFTConfig
@@ -144,8 +145,10 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         return parallel
 
     def _read_components(self, folder: Path) -> dict[str, Weights]:
-        """Read the files of the components that the settings use; raise `ConfigError` if one is
-        missing, or if there is one that they do not use.
+        """Read the files of the components that the settings use.
+
+        Raise `ConfigError` if a file is missing, or if there is a file of a component that the
+        settings do not use.
         """
         uses = {
             "action_head": self.config.head != "tokens",
@@ -158,7 +161,7 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
 
     def perceive(self, obs: Obs) -> tuple[StagedRow, np.ndarray | None]:
         """Return the images, in the order of training, as inputs of the backbones, and the state
-        vector (P,).
+        vector, (P,).
         """
         images = [prismatic.resize(image) for image in camera_images(obs, self._cameras).values()]
         if self.config.center_crop:
@@ -184,8 +187,9 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         return ModelInput(images, base.tokens(row.instruction), proprio)
 
     def _compute(self, prepared: Sequence[prismatic.PreparedRow]) -> list[Prediction]:
-        """Run one forward pass, or one per diffusion step. Regression gives a session's samples
-        the same answer.
+        """Run one forward pass, or one pass per diffusion step.
+
+        With regression, all samples of a session are equal.
         """
         firsts, owners = self.observations_of([entry.row for entry in prepared])
         inputs = [prepared[i].model_input for i in firsts]
@@ -211,8 +215,9 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
 
 
 def _action_dim(statistics: prismatic.Statistics, unnorm_key: str | None, head: Mlp | None) -> int:
-    """Return the length of an action, which must be the same for the head and all datasets that
-    episodes may select.
+    """Return the length of an action.
+
+    It must be the same for the head and for all datasets that episodes may select.
     """
     dims = statistics.action_dims(unnorm_key)
     if head is not None:
@@ -225,7 +230,7 @@ def _action_dim(statistics: prismatic.Statistics, unnorm_key: str | None, head: 
     return dims.pop()
 
 
-_STOP = 2  # Llama's end of text, which follows the actions in training
+_STOP = 2  # Llama's end-of-text token, which follows the actions in training
 
 
 @dataclass(frozen=True)
@@ -238,38 +243,37 @@ class ModelInput:
 
 
 class Sequences(NamedTuple):
-    """The embeddings from which sequences are assembled, apart from the actions, and their
-    order.
+    """The embeddings from which sequences are assembled, without the embeddings of the actions, and
+    the order of the tokens.
     """
 
-    perceived: Any  # (B, P, D), of images and state
+    perceived: Any  # embeddings of images and state, (B, P, D)
     words: Any  # (B, L, D)
-    indices: Any  # (B, T), as for `Prismatic.assemble`; the actions are the last segment
-    lengths: Any  # (B,), without padding
+    indices: Any  # indices for `Prismatic.assemble`, (B, T); the actions are the last segment
+    lengths: Any  # lengths without padding, (B,)
 
 
 @dataclass
 class Parallel:
-    """A checkpoint of OFT: OpenVLA's, and its components; a component is None if training did not
-    use it.
+    """A checkpoint of OpenVLA-OFT: the checkpoint of OpenVLA, and the added components.
 
-    `encode_images` and `hidden_states` are functions of tensors, which `compile_with` replaces with
-    their compiled forms.
+    A component is None if training did not use it. `encode_images` and `hidden_states` are
+    functions of tensors, which `compile_with` replaces with their compiled forms.
     """
 
     base: prismatic.Prismatic
     horizon: int  # H, the number of rows of a chunk
     dim: int  # D, the length of a row
-    head: Mlp | None  # None: action tokens
+    head: Mlp | None  # None with action tokens
     proprio: Projector | None
-    noisy: Projector | None  # embeds noisy actions: the head is a diffusion head
+    noisy: Projector | None  # embeds noisy actions; only for a diffusion head
     film: Film | None
-    steps: tuple[int, int]  # diffusion steps: in training, at inference
+    steps: tuple[int, int]  # number of diffusion steps in training, and at inference
 
     @property
     def trained(self) -> dict[str, Any]:
-        """The components that upstream's training saves: modules, and tensors by their names in
-        its files.
+        """The components that upstream's training saves: modules, or tensors by their names in
+        upstream's files.
         """
         components = {
             "action_head": self.head,
@@ -284,12 +288,12 @@ class Parallel:
         return trained
 
     def compile_with(self, compilation: Compilation) -> None:
-        """Replace the passes with their compiled forms, if they are compiled."""
+        """Replace the forward passes with their compiled forms, if compilation is enabled."""
         self.encode_images = compilation.core("vision encoder", self.encode_images)  # type: ignore[method-assign]
         self.hidden_states = compilation.core("language model", self.hidden_states)  # type: ignore[method-assign]
 
     def regress(self, inputs: Sequence[ModelInput]) -> np.ndarray:
-        """Compute chunks (B, H, D) in [-1, 1] in one pass, with the head of regression."""
+        """Compute chunks, (B, H, D) in [-1, 1], in one pass, with the regression head."""
         with require("torch").inference_mode():
             hidden = self._hidden(self._sequences(inputs))
             return fetch(self._apply_head(hidden).float())
@@ -339,11 +343,11 @@ class Parallel:
             return bins.choose(likeliest, bin_logits, self.base.upload(draws)), bin_logits
 
     def _apply_head(self, hidden: Any) -> Any:
-        """Return the head's output (B, H, D) for hidden states (B, H * D, …)."""
+        """Return the head's output, (B, H, D), for hidden states, (B, H * D, …)."""
         return self.head(hidden.reshape(len(hidden), self.horizon, -1))  # type: ignore[misc]
 
     def _predict_noise(self, sequences: Sequences, time: int, actions: Any) -> Any:
-        """Return the noise in actions (B, H, D) at a time of training."""
+        """Return the predicted noise in actions, (B, H, D), at a diffusion time of training."""
         perceived = sequences.perceived
         embedding = time_embedding(time, perceived.shape[-1], actions.device).to(actions.dtype)
         embedding = embedding.expand(len(perceived), 1, -1)
@@ -352,15 +356,16 @@ class Parallel:
         return self._apply_head(self._hidden(timed, noisy))
 
     def _sequences(self, inputs: Sequence[ModelInput]) -> Sequences:
-        """Return the sequences of inputs; for a diffusion head, with a position for the time after
-        images and state.
+        """Return the sequences of inputs.
+
+        For a diffusion head, they have a position for the time after images and state.
         """
         torch, base = require("torch"), self.base
         prompts = [[*model_input.tokens, _STOP] for model_input in inputs]
         words = base.embed(base.pad(prompts))
         counts = base.upload([len(tokens) for tokens in prompts])
 
-        # FiLM reads the mean of a prompt's words.
+        # FiLM reads the mean embedding of a prompt's words.
         padding = torch.arange(words.shape[1], device=base.device) >= counts[:, None]
         language = words.float().masked_fill(padding[..., None], 0).sum(1) / counts[:, None]
         pixels = base.pixels([model_input.images for model_input in inputs])
@@ -369,15 +374,16 @@ class Parallel:
             states = base.upload([model_input.proprio for model_input in inputs]).to(base.dtype)
             perceived = torch.cat([perceived, self.proprio(states)[:, None]], 1)
 
-        # Indices into images and state, the time, the words and the actions, counted from 1.
+        # Indices into the concatenation of images and state, the time, the words and the actions,
+        # counted from 1.
         has_time = self.noisy is not None
-        first = 1 + perceived.shape[1] + has_time  # the index of a row's first token
+        first = 1 + perceived.shape[1] + has_time  # index of the row's first token
         action_count = self.horizon * self.dim
         if has_time:
             first_action = first + words.shape[1]
             actions = list(range(first_action, first_action + action_count))
         else:
-            actions = [0] * action_count  # vectors of zeros
+            actions = [0] * action_count  # index 0 selects a vector of zeros
         order = []
         for tokens in prompts:
             last = first + len(tokens) - 1
@@ -388,8 +394,9 @@ class Parallel:
         return Sequences(perceived, words, indices, counts + (first - 1 + action_count))
 
     def encode_images(self, pixels: Any, language: Any) -> Any:
-        """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` (P, D) is
-        the mean of the words.
+        """Return the embeddings, (P, N, D), of images, (P, views, C, S, S).
+
+        `language`, (P, D), is the mean embedding of the words.
         """
         views = pixels.shape[1]
         images = pixels.flatten(0, 1)
@@ -410,7 +417,7 @@ class Parallel:
         Returns:
             The hidden states, (B, L, D).
         """
-        import torch  # the compiler follows an import statement, but not `require`
+        import torch  # torch's compiler follows an import statement, but not `require`
 
         model, length = self.base.network.language_model.model, embeddings.shape[1]
         positions = lengths.new_ones(1, length).cumsum(1) - 1
@@ -422,18 +429,19 @@ class Parallel:
         return model.norm(embeddings)
 
     def _hidden(self, sequences: Sequences, *actions: Any) -> Any:
-        """Return the hidden states (B, H * D, …) that predict the numbers of actions.
+        """Return the hidden states, (B, H * D, …), from which the numbers of the actions are
+        predicted.
 
         Args:
             sequences: The sequences.
             actions: The embeddings of noisy actions, (B, H * D, …), for a diffusion head; other
-                heads have zeros in their place.
+                heads use zeros instead.
         """
         segments = [sequences.perceived, sequences.words, *actions]
         embeddings = self.base.assemble(segments, sequences.indices)
         hidden = self.hidden_states(embeddings, sequences.lengths)
 
-        # The preceding token predicts an action, as in training.
+        # As in training, the token before an action predicts the action.
         count = self.horizon * self.dim
         offsets = require("torch").arange(count, device=self.base.device)
         positions = sequences.lengths[:, None] - count - 2 + offsets
@@ -445,7 +453,8 @@ def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps:
 
     Args:
         noise: (B, H, D), standard normal.
-        predict: Returns the noise in actions (B, H, D) at a time of training.
+        predict: A function that returns the predicted noise in actions, (B, H, D), at a diffusion
+            time of training.
         trained: The number of diffusion steps in training.
         steps: The number of diffusion steps at inference.
 
@@ -465,7 +474,7 @@ def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps:
 
 
 def time_embedding(time: int, dim: int, device: Any) -> Any:
-    """Return the embedding of a time, (dim,) float32: sines, then cosines."""
+    """Return the embedding of a diffusion time, (dim,) float32: sines, then cosines."""
     torch = require("torch")
     half = dim // 2
     rates = torch.exp(torch.arange(half, device=device) * -math.log(10000) / (half - 1))
@@ -473,7 +482,7 @@ def time_embedding(time: int, dim: int, device: Any) -> Any:
 
 
 def _signal_shares(trained: int) -> list[float]:
-    """Return the share of the signal in noisy actions at each time of training."""
+    """Return the share of the signal in noisy actions at each diffusion time of training."""
 
     def alpha(x: float) -> float:
         return math.cos((x + 0.008) / 1.008 * math.pi / 2) ** 2
@@ -483,9 +492,9 @@ def _signal_shares(trained: int) -> list[float]:
     return shares
 
 
-Weights = dict[str, Any]  # tensors by name
+Weights = dict[str, Any]  # name -> tensor
 
-# The layers of a head.
+# The names of the layers of a head.
 _MLP = (
     "layer_norm1",
     "fc1",
@@ -496,7 +505,7 @@ _MLP = (
     "layer_norm2",
     "fc2",
 )
-_WRAPPED = "module."  # prefix of all names after distributed training
+_WRAPPED = "module."  # prefix of all names in files of distributed training
 _LORA_ALPHA = 16  # upstream's scale is min(rank, 16) / rank
 
 
@@ -511,7 +520,7 @@ def read_component(folder: Path, name: str) -> dict[str, Any]:
         The tensors by name.
 
     Raises:
-        ConfigError: There is no such file, or there are several.
+        ConfigError: There is no such file, or there are several files.
     """
     files = sorted(path.name for path in folder.glob(f"{name}--*checkpoint.pt"))
     if len(files) != 1:
@@ -529,7 +538,7 @@ def require_unused(folder: Path, names: Iterable[str]) -> None:
     """Check that a checkpoint has no file of these components.
 
     Raises:
-        ConfigError: There is a file of a component, which the settings do not use.
+        ConfigError: There is a file of a component that the settings do not use.
     """
     for name in names:
         if any(folder.glob(f"{name}--*")):
@@ -540,8 +549,9 @@ def require_unused(folder: Path, names: Iterable[str]) -> None:
 
 
 def _require_layers(weights: Weights, layers: Iterable[str], component: str) -> Weights:
-    """Return the weights of a component; raise `ConfigError` unless they are a weight and a bias of
-    each layer.
+    """Return the weights of a component.
+
+    Raise `ConfigError` unless they are exactly a weight and a bias for each layer.
     """
     expected: set[str] = set()
     for layer in layers:
@@ -557,18 +567,18 @@ def _require_layers(weights: Weights, layers: Iterable[str], component: str) -> 
 
 
 class Component:
-    """A network that fine-tuning added to OpenVLA, as its tensors by name."""
+    """A network that fine-tuning added to OpenVLA, stored as tensors by name."""
 
-    weights: Weights  # by upstream's names, which a learner pushes
+    weights: Weights  # upstream's name, which a learner pushes -> tensor
     _prefix = ""  # prefix of all names
 
     def to(self, device: Any, dtype: Any) -> Self:
-        """Move the weights to a device and convert them to a type; return the component."""
+        """Move the weights to a device, convert them to a type, and return the component."""
         self.weights = {name: tensor.to(device, dtype) for name, tensor in self.weights.items()}
         return self
 
     def _linear(self, layer: str, x: Any) -> Any:
-        import torch  # the compiler follows an import statement, but not `require`
+        import torch  # torch's compiler follows an import statement, but not `require`
 
         return torch.nn.functional.linear(x, *self._weight_and_bias(layer))
 
@@ -578,7 +588,9 @@ class Component:
 
 
 class Mlp(Component):
-    """A head: an MLP with residual blocks over the hidden states of one row's action tokens."""
+    """A head: an MLP with residual blocks, applied to the hidden states of one row's action
+    tokens.
+    """
 
     def __init__(self, saved: Weights, prefix: str) -> None:
         layers = [f"{prefix}.{layer}" for layer in _MLP]
@@ -605,7 +617,9 @@ class Mlp(Component):
 
 
 class Projector(Component):
-    """Maps numbers to embeddings of the language model: two layers with GELU between them."""
+    """A projection of numbers to embeddings of the language model: two layers with GELU between
+    them.
+    """
 
     def __init__(self, saved: Weights, name: str) -> None:
         self.weights = _require_layers(saved, ("fc1", "fc2"), name)
@@ -654,16 +668,16 @@ class Film(Component):
         self.weights = _require_layers(film, layers, "vision_backbone")
 
     def __call__(self, pixels: Any, language: Any) -> Any:
-        """Return the patches of images for instructions.
+        """Return the features of the images' patches, conditioned on the instructions.
 
         Args:
             pixels: The images, (B, C, S, S), with three channels for each backbone.
             language: The mean of the embeddings of each instruction, (B, D).
 
         Returns:
-            The patches, (B, P, V).
+            The features of the patches, (B, P, V).
         """
-        import torch  # the compiler follows an import statement, but not `require`
+        import torch  # torch's compiler follows an import statement, but not `require`
 
         patches = []
         for name, channels in zip(self._vits, pixels.split(3, dim=1), strict=True):
@@ -685,9 +699,8 @@ class Film(Component):
 
 
 def _merged(saved: Weights) -> dict[str, Any]:
-    """Add the low-rank adapters to their layers, including convolutions.
-
-    OFT+ saves adapters separately.
+    """Add low-rank adapters, which OFT+ saves separately, to the weights of their layers, including
+    convolutions.
     """
     merged = {}
     for name, tensor in saved.items():

@@ -1,9 +1,9 @@
-"""OpenVLA: decodes the next action from an image and an instruction, token by token.
+"""OpenVLA, which decodes the next action from an image and an instruction, token by token.
 
-Upstream's `predict_action` accepts one prompt and calls `generate`. Here prompts of different
-lengths are padded on the left, with masks and positions that give each the same result as alone,
-and share every forward pass. Keys and values are one tensor of a fixed length, which has a masked
-entry for each future token.
+Upstream's `predict_action` accepts one prompt and calls `generate`. Here, prompts of different
+lengths share every forward pass. They are padded on the left, with masks and positions that give
+each prompt the same result as alone. Keys and values are one tensor of a fixed length, with a
+masked entry for each future token.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.key_value_cache import stack_of
 from vlagents_ray_models.openvla import prismatic
 
-_IMAGE = "image"  # the model's only camera
-_CACHE = 3  # the number of that argument of `TokenDecoder.continue_from`
+_IMAGE = "image"  # name of the model's only camera
+_CACHE = 3  # index of the argument `cache` of `TokenDecoder.continue_from`
 
 
 class OpenVLAConfig(prismatic.PrismaticConfig):
@@ -36,14 +36,15 @@ class OpenVLAConfig(prismatic.PrismaticConfig):
 
     center_crop: bool = Field(
         default=False,
-        description="for checkpoints trained with random crops, such as LIBERO's: pictures go "
-        "through JPEG and Lanczos to 224 px, and the middle nine tenths of them to the model; else "
-        "the checkpoint's own resizing is all",
+        description="for checkpoints trained with random crops, such as LIBERO's: images are "
+        "compressed as JPEG and resized to 224 px with Lanczos, and the model receives the "
+        "central nine tenths of their area; otherwise only the checkpoint's own resizing is "
+        "applied",
     )
 
 
 class OpenVLA(prismatic.PrismaticPolicy):
-    """The policy OpenVLA, which returns one action for each `act`."""
+    """The policy OpenVLA, which returns one action for each call."""
 
     Config = OpenVLAConfig
     config: OpenVLAConfig
@@ -68,10 +69,10 @@ class OpenVLA(prismatic.PrismaticPolicy):
         """Read the checkpoint.
 
         Raises:
-            ConfigError: It is incomplete, or the settings do not fit it.
+            ConfigError: The checkpoint is incomplete, or the settings do not fit it.
         """
         base = prismatic.load_prismatic(self.config)
-        if self.config.attention != "flash_attention_2":  # which reads the mask as it is
+        if self.config.attention != "flash_attention_2":  # this attention uses the mask unchanged
             model = base.network.language_model.model
             model._update_causal_mask = partial(_causal_mask, model._update_causal_mask)
 
@@ -91,8 +92,10 @@ class OpenVLA(prismatic.PrismaticPolicy):
         return row.frames[-1], self.model.base.tokens(row.instruction)
 
     def _compute(self, prepared: Sequence[prismatic.PreparedRow]) -> list[Prediction]:
-        """Decode all answers: sessions greedily unless outputs are requested, samples at
-        temperature 1.
+        """Decode all answers.
+
+        Answers to sessions are decoded greedily unless outputs are requested, and samples are drawn
+        at temperature 1.
         """
         draws = np.full((len(prepared), max(entry.scale.dim for entry in prepared)), np.nan)
         for row_draws, entry in zip(draws, prepared, strict=True):
@@ -111,14 +114,14 @@ class OpenVLA(prismatic.PrismaticPolicy):
 
 @dataclass
 class TokenDecoder:
-    """A checkpoint and its passes.
+    """A checkpoint and its forward passes.
 
     The passes are functions of tensors, which `compile_with` replaces with their compiled forms.
     """
 
     base: prismatic.Prismatic
-    longest: int  # the largest number of tokens of an answer
-    adapters: LoraAdapters = field(default_factory=LoraAdapters)  # adapters of the policy
+    longest: int  # largest number of tokens in an answer
+    adapters: LoraAdapters = field(default_factory=LoraAdapters)  # the adapters of the policy
 
     def compile_with(self, compilation: Compilation) -> None:
         """Replace the passes with their compiled forms, if they are compiled."""
@@ -137,13 +140,15 @@ class TokenDecoder:
 
         Args:
             prompts: The image and the tokens of each prompt.
-            owners: (R,), the prompt of each answer; a prompt with several answers is read once.
-            draws: (R, S) with a column for each token, for `ActionBins.choose`.
-            fingerprints: (P,), the adapter of each prompt, see `Row.adapter`; empty: no prompt has
-                one.
+            owners: The index of the prompt of each answer, (R,). A prompt with several answers is
+                processed once.
+            draws: The draws for `ActionBins.choose`, (R, S), with a column for each token.
+            fingerprints: The adapter of each prompt, (P,), see `Row.adapter`; empty if no prompt
+                has an adapter.
 
         Returns:
-            Tokens (R, S), and the logits of the bins (R, S, bins) from which they were chosen.
+            The tokens, (R, S), and the logits of the bins from which they were chosen, (R, S,
+            bins).
         """
         torch, base, steps = require("torch"), self.base, draws.shape[1]
         with torch.inference_mode(), self.adapters.rows(fingerprints):
@@ -158,13 +163,14 @@ class TokenDecoder:
                 hidden, mask, cache = hidden[index], mask[index], cache[index]
             length, position = mask.shape[1], mask.sum(1)
 
-            # One entry for each token but the last, and one at the end for the current token.
+            # The mask has an entry for each token except the last, and an entry at the end for the
+            # current token.
             entries = max(steps, self.longest)
             cache = torch.nn.functional.pad(cache, (0, 0, 0, entries - 1))
             mask = torch.nn.functional.pad(mask, (0, entries))
             mask[:, -1] = 1
-            # The loop adds its entries to the tensor from which a CUDA graph reads: a copy of the
-            # cache for each token would be 155 MB a row.
+            # The loop writes its entries directly into the tensor from which a CUDA graph reads,
+            # since a copy of the cache for each token would take 155 MB per row.
             cache = held(self.continue_from, _CACHE, cache)
 
             tokens: list[Any] = []
@@ -207,13 +213,13 @@ class TokenDecoder:
         return result.last_hidden_state[:, -1], stack_of(result.past_key_values)
 
     def continue_from(self, tokens: Any, positions: Any, mask: Any, cache: Any) -> tuple[Any, Any]:
-        """Run the language model on one more token of each row.
+        """Run the language model on the next token of each row.
 
         Args:
             tokens: The tokens, (R,).
             positions: Their positions in the texts of their rows, (R,).
-            mask: (R, T + 1), 0 for those of the T entries of the cache to which a token does not
-                attend; the last column is for the token itself.
+            mask: The attention mask, (R, T + 1). It is 0 for each of the T cache entries to which a
+                token does not attend. The last column is for the token itself.
             cache: Keys and values, (R, layers, 2, heads, T, E).
 
         Returns:
@@ -241,7 +247,7 @@ class TokenDecoder:
         pixels = base.pixels([staged for staged, _ in prompts]).flatten(0, 1)
         patches = self.encode_images(pixels)
 
-        # Indices into the patches and then the tokens, counted from 1.
+        # Indices into the concatenation of patches and tokens, counted from 1.
         first = 1 + patches.shape[1]  # the index of a row's first token
         order = [
             [first, *range(1, first), *range(first + 1, first + len(tokens))] for tokens in rows
@@ -258,19 +264,21 @@ def _causal_mask(
     positions: Any,
     *arguments: Any,
 ) -> Any:
-    """Return the attention mask of Llama, without reading whether anything is masked.
+    """Return the attention mask of Llama, without reading whether any token is masked.
 
-    Llama's own code reads that: each pass would wait for a GPU, and no graph could be captured.
+    Llama's own code reads this from the GPU, so that each pass would wait for the GPU, and no graph
+    could be captured.
 
     Args:
         update_causal_mask: Llama's own code, for masks of another shape.
-        mask: (B, K), 0 where no token attends; None: all attend.
+        mask: (B, K), 0 at tokens to which no token attends; None if tokens attend to all.
         embeddings: The embeddings of the tokens, (B, Q, D).
         positions: The positions of the tokens in the cache, (Q,).
         arguments: Further arguments of Llama's code.
 
     Returns:
-        (B, 1, Q, K): 0 where a token attends, else the smallest number of the embeddings' type.
+        (B, 1, Q, K): 0 where a token attends, otherwise the smallest number of the embeddings'
+        type.
     """
     import torch  # the compiler follows an import statement, but not `require`
 
@@ -278,7 +286,8 @@ def _causal_mask(
         return update_causal_mask(mask, embeddings, positions, *arguments)
     is_later = torch.arange(mask.shape[1], device=mask.device) > positions[:, None]
     hidden = is_later | (mask[:, None] == 0)
-    # Padding attends to all: fast kernels give NaN for a token that attends to nothing.
+    # Padding attends to all tokens, since fast kernels return NaN for a token that attends to
+    # nothing.
     hidden = hidden & ~hidden.all(-1, keepdim=True)
     shown = torch.zeros_like(hidden, dtype=embeddings.dtype)
     return shown.masked_fill(hidden, torch.finfo(embeddings.dtype).min)[:, None]

@@ -41,13 +41,13 @@ from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.outcomes import attempt, compute_valid
 from vlagents_ray.registry import require
 
-# The range of each dimension: 1st and 99th percentile, or minimum and maximum.
+# The bounds of each dimension's range: 1st and 99th percentile, or minimum and maximum.
 Bounds = Literal["q99", "min_max"]
 _STATISTICS = {"q99": ("q01", "q99"), "min_max": ("min", "max")}
 
-# Written by fine-tuning; it overrides the statistics in config.json.
+# This file is written by fine-tuning. It has priority over the statistics in config.json.
 STATISTICS_FILE = "dataset_statistics.json"
-_EPSILON = 1e-8  # upstream's value, for dimensions that never moved
+_EPSILON = 1e-8  # upstream's value, for dimensions that never changed
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +56,12 @@ class Scale:
 
     low: np.ndarray  # (D,) float64
     high: np.ndarray  # (D,)
-    mask: np.ndarray  # (D,) bool; other dimensions, such as the gripper, are not normalised
+    # Dimensions that are normalised, (D,) bool; others, such as the gripper, are unchanged.
+    mask: np.ndarray
 
     @property
     def dim(self) -> int:
-        """D, the number of dimensions."""
+        """The number of dimensions, D."""
         return len(self.low)
 
     def restore(self, normalised: np.ndarray) -> np.ndarray:
@@ -130,7 +131,8 @@ class Statistics:
                 dataset.
 
         Raises:
-            InvalidObservation: There is no such dataset, or there are several for None.
+            InvalidObservation: The dataset does not exist, or `name` is None and there are several
+                datasets.
         """
         if name is None and len(self._datasets) == 1:
             return next(iter(self._datasets))
@@ -147,7 +149,7 @@ class Statistics:
         """Return the ranges of a dataset's actions or proprioception.
 
         Raises:
-            ConfigError: The statistics lack them.
+            ConfigError: The statistics contain no such ranges.
         """
         statistics = self._datasets[key].get(feature, {})
         low, high = _STATISTICS[self.bounds]
@@ -166,15 +168,15 @@ class Statistics:
         )
 
     def action_dims(self, name: str | None = None) -> set[int]:
-        """Return the lengths of the actions of a dataset; None: of all datasets."""
+        """Return the lengths of the actions of a dataset, or of all datasets for None."""
         keys = self._datasets if name is None else [self.key(name)]
         return {self.scale(key).dim for key in keys}
 
     def require(self, name: str | None) -> None:
-        """Check the dataset that a deployment selects; None: it selects none.
+        """Check the dataset that a deployment selects, or None if it selects none.
 
         Raises:
-            ConfigError: There is no such dataset, or it has no ranges of actions.
+            ConfigError: The dataset does not exist, or has no ranges of actions.
         """
         if name is None:
             return
@@ -186,10 +188,12 @@ class Statistics:
 
 
 _NEEDS = ("config.json", "preprocessor_config.json", "tokenizer_config.json", "*.safetensors")
-_SPACE = 29871  # Llama's token of an empty word, between "Out:" and the action in training
+# Llama's token for an empty word, which was between "Out:" and the action in training.
+_SPACE = 29871
 _PIXELS = "pixels"
 _PROMPT = "In: What action should the robot take to {}?\nOut:"
-# OpenVLA v0.1 was fine-tuned from Vicuna; upstream also detects it by the checkpoint's name.
+# OpenVLA v0.1 was fine-tuned from Vicuna. Upstream also detects this version by the name of the
+# checkpoint.
 _PROMPT_V01 = (
     "A chat between a curious user and an artificial intelligence assistant. The assistant gives "
     "helpful, detailed, and polite answers to the user's questions. USER: What action should the "
@@ -202,31 +206,32 @@ class Prismatic:
     """A loaded checkpoint."""
 
     path: Path
-    # OpenVLAForActionPrediction; uses its vision_backbone, projector and language_model.
+    # An OpenVLAForActionPrediction, of which vision_backbone, projector and language_model are
+    # used.
     network: Any
     tokenizer: Any
-    processor: Any  # PrismaticImageProcessor
+    processor: Any  # a PrismaticImageProcessor
     bins: ActionBins
     statistics: Statistics
     prompt: str
     device: Any
     dtype: Any
     staging: Staging
-    # The length to which shorter prompts are padded; 0: the length of the longest prompt.
+    # The length to which shorter prompts are padded; 0 means the length of the longest prompt.
     padded_tokens: int
-    # Fingerprint of an adapter -> its statistics, if it was trained on other datasets.
+    # Fingerprint of an adapter -> the adapter's statistics, if it was trained on other datasets.
     adapter_statistics: dict[str, Statistics] = field(default_factory=dict)
 
     def stage(self, images: Sequence[np.ndarray]) -> StagedRow:
-        """Begin to copy V images, (H, W, 3) uint8, to the model's device, in the format of the
-        checkpoint's backbones.
+        """Convert V images, (H, W, 3) uint8, to the format of the checkpoint's backbones, and begin
+        to copy them to the model's device.
         """
         convert = require("PIL.Image").fromarray
         pixels = [self.processor.apply_transform(convert(image)).numpy() for image in images]
         return self.staging.stage({_PIXELS: np.stack(pixels)})
 
     def pixels(self, rows: Sequence[StagedRow]) -> Any:
-        """Return the images (B, V, C, S, S) of rows of `stage`, on the device and in the model's
+        """Return the images of staged rows, (B, V, C, S, S), on the device and in the model's
         dtype.
         """
         return self.staging.stack(rows)[_PIXELS].to(self.dtype)
@@ -248,9 +253,9 @@ class Prismatic:
 
     @cached_property
     def _tokenize(self) -> Callable[[str], list[int]]:
-        """A function that tokenizes the prompt for an instruction.
+        """A cached function that tokenizes the prompt for an instruction.
 
-        It has a cache, since the instruction is the same in each call of a session.
+        A session uses the same instruction in each call.
         """
 
         @keeping_tokens
@@ -262,7 +267,7 @@ class Prismatic:
         return tokenize
 
     def upload(self, numbers: Any) -> Any:
-        """Copy numbers to the model's device, without waiting for the GPU's computations."""
+        """Copy numbers to the model's device, without waiting for computations of the GPU."""
         return self.staging.upload(np.asarray(numbers))
 
     def pad(self, rows: Sequence[Sequence[int]], length: int = 0, *, left: bool = False) -> Any:
@@ -285,7 +290,7 @@ class Prismatic:
         return self.upload(padded)
 
     def embed(self, tokens: Any) -> Any:
-        """Return the embeddings (…, D) of tokens (…)."""
+        """Return the embeddings, (…, D), of tokens, (…)."""
         return self.network.get_input_embeddings()(tokens)
 
     @staticmethod
@@ -293,9 +298,10 @@ class Prismatic:
         """Assemble sequences from the embeddings of concatenated segments.
 
         Args:
-            segments: Embeddings (B, N, D) with an N for each segment.
-            indices: (B, L), for each position of a sequence an index into the concatenation of the
-                row's segments, counted from 1; 0 is a vector of zeros.
+            segments: The embeddings of each segment, (B, N, D), where N may differ between
+                segments.
+            indices: For each position of a sequence, an index into the concatenation of the row's
+                segments, counted from 1, (B, L). 0 selects a vector of zeros.
 
         Returns:
             The sequences, (B, L, D).
@@ -305,7 +311,7 @@ class Prismatic:
 
 
 def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic:
-    """Load a checkpoint of OpenVLA, or the base of one of OpenVLA-OFT.
+    """Load a checkpoint of OpenVLA, or the base of an OpenVLA-OFT checkpoint.
 
     Args:
         config: The settings of the policy.
@@ -389,8 +395,9 @@ class PrismaticConfig(ModelConfig):
 
 
 class ActionBins:
-    """The bins of [-1, 1], which are the last tokens of the vocabulary; the very last token is
-    the lowest bin.
+    """The bins of [-1, 1], which are the last tokens of the vocabulary.
+
+    The very last token is the lowest bin.
     """
 
     def __init__(self, config: Any, device: Any) -> None:
@@ -398,7 +405,7 @@ class ActionBins:
         edges = np.linspace(-1, 1, config.n_action_bins)
         middles = (edges[:-1] + edges[1:]) / 2
         self._first = config.text_config.vocab_size - config.pad_to_multiple_of - 1
-        # There is one token more than there are bins.
+        # There is one more token than bins.
         self._middles = torch.tensor(np.append(middles, middles[-1]), device=device)
         self._tokens = self._first - torch.arange(config.n_action_bins, device=device)
 
@@ -406,21 +413,21 @@ class ActionBins:
         """Read the logits of a language model.
 
         Args:
-            logits: (…, V), for all tokens of the vocabulary.
+            logits: The logits of all tokens of the vocabulary, (…, V).
 
         Returns:
-            The likeliest of all tokens (…), and the logits of the bins (…, bins), float64.
+            The most likely of all tokens, (…), and the logits of the bins, (…, bins) float64.
         """
         return logits.argmax(-1), logits[..., self._tokens].double()
 
     def choose(self, likeliest: Any, bin_logits: Any, draws: Any) -> Any:
-        """Choose tokens: bins at given quantiles, or the likeliest tokens.
+        """Choose tokens: bins at the given quantiles, or the most likely tokens.
 
         Args:
-            likeliest: The likeliest of all tokens (…), from `read`.
+            likeliest: The most likely of all tokens, (…), from `read`.
             bin_logits: The logits of the bins (…, bins), from `read`.
-            draws: (…) in [0, 1), quantiles of the distributions over bins; NaN selects the
-                likeliest of all tokens, as upstream does.
+            draws: Quantiles of the distributions over bins, (…) in [0, 1). NaN selects the most
+                likely of all tokens, as upstream does.
 
         Returns:
             The tokens (…).
@@ -432,23 +439,24 @@ class ActionBins:
         return torch.where(draws.isnan(), likeliest, self._tokens[drawn])
 
     def logprob(self, tokens: Any, logits: Any) -> Any:
-        """Return the log-probabilities (…) of tokens (…) among the bins, nats, differentiable in
-        logits (…, V).
+        """Return the log-probabilities of tokens among the bins, (…) nats.
+
+        The result is differentiable with respect to the logits, (…, V).
         """
         log_shares = logits[..., self._tokens].double().log_softmax(-1)
         return log_shares.gather(-1, (self._first - tokens)[..., None])[..., 0]
 
     def describe(self, tokens: Any, bin_logits: Any) -> np.ndarray:
-        """Compute the values and the distributions of tokens, with one copy from the device.
+        """Compute the values and the distributions of tokens, with a single copy from the device.
 
         Args:
             tokens: The chosen tokens (…).
             bin_logits: The logits of the bins (…, bins), float64.
 
         Returns:
-            (6, …) float64: values in [-1, 1], of the nearest bin for other tokens, as upstream;
-            mean and standard deviation over the bins; log-probability and entropy, nats; and the
-            tokens.
+            (6, …) float64: values in [-1, 1], where other tokens have the value of the nearest bin,
+            as upstream; mean and standard deviation over the bins; log-probability and entropy,
+            nats; and the tokens.
         """
         torch = require("torch")
         shares = bin_logits.softmax(-1)
@@ -463,7 +471,7 @@ class ActionBins:
 
 
 MODEL, PROCESSOR = "OpenVLAForActionPrediction", "PrismaticImageProcessor"
-# Either serves both policies, which use code common to both.
+# Either variable is sufficient for both policies, which use the code that both repositories share.
 VARIABLES = ("OPENVLA_SRC", "OPENVLA_OFT_SRC")
 _PACKAGES = (
     "prismatic",
@@ -495,7 +503,7 @@ def model_classes(
 
 
 def _remote(checkpoint: Path, file: str, auto_class: str) -> Any:
-    """Return the class that a JSON file of the checkpoint names for a class of transformers."""
+    """Return the class that a JSON file of the checkpoint assigns to a class of transformers."""
     content = json.loads((checkpoint / file).read_text(encoding="utf-8"))
     class_reference = content.get("auto_map", {}).get(auto_class)
     if class_reference is None:
@@ -512,8 +520,8 @@ def find_source(source_dir: str | None) -> Path:
     """Find the folder that contains the package `prismatic`.
 
     Args:
-        source_dir: The folder, if the settings name one; None: $OPENVLA_SRC, $OPENVLA_OFT_SRC, or
-            the folder of an installed `prismatic`.
+        source_dir: The folder in the settings. With None, the function tries $OPENVLA_SRC,
+            $OPENVLA_OFT_SRC and the folder of an installed `prismatic`.
 
     Raises:
         ConfigError: No folder contains the model's classes.
@@ -523,7 +531,7 @@ def find_source(source_dir: str | None) -> Path:
     else:
         folders = [os.environ[name] for name in VARIABLES if os.environ.get(name)]
     if not folders:
-        spec = importlib.util.find_spec("prismatic")  # finds the package without importing it
+        spec = importlib.util.find_spec("prismatic")  # this finds the package without importing it
         if spec is not None:
             packages = spec.submodule_search_locations or ()
             folders = [str(Path(package).parent) for package in packages]
@@ -543,7 +551,7 @@ def find_source(source_dir: str | None) -> Path:
 @lru_cache(maxsize=4)
 def _from_source(root: Path) -> tuple[Any, Any]:
     """Import the classes of the model and of its image processor from a source tree."""
-    # OFT's code prints settings that do not apply here.
+    # The code of OpenVLA-OFT prints settings that do not apply here.
     with _bare_packages(root), contextlib.redirect_stdout(io.StringIO()):
         modeling = importlib.import_module("prismatic.extern.hf.modeling_prismatic")
         processing = importlib.import_module("prismatic.extern.hf.processing_prismatic")
@@ -552,8 +560,8 @@ def _from_source(root: Path) -> tuple[Any, Any]:
 
 @contextlib.contextmanager
 def _bare_packages(root: Path) -> Iterator[None]:
-    """Import from `root` without running the `__init__` of its packages, which would import
-    TensorFlow and more.
+    """Import from `root` without running the `__init__` of the packages, which would import
+    TensorFlow and other libraries.
     """
     earlier_modules = _remove_modules()
     for name in _PACKAGES:
@@ -563,7 +571,7 @@ def _bare_packages(root: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        # torch.compile imports the module of a function that it compiles, by the module's name.
+        # torch.compile imports the module of each compiled function by the module's name.
         alias = f"prismatic_{hashlib.sha256(str(root).encode()).hexdigest()[:16]}"
         for name, module in _remove_modules().items():
             module.__name__ = name.replace("prismatic", alias, 1)
@@ -577,10 +585,10 @@ def _remove_modules() -> dict[str, types.ModuleType]:
     return {name: sys.modules.pop(name) for name in names}
 
 
-# Key of reset's options and of an observation's info, as sent by OpenVLA's clients.
+# The key in the options of a reset and in the info of an observation, as OpenVLA's clients send it.
 UNNORM_KEY = "unnorm_key"
-OFFERED = ("logprob", "entropy", "replay")  # values that are offered for action tokens
-_SINGLE_ARM = 7  # six numbers for motion, one for the gripper
+OFFERED = ("logprob", "entropy", "replay")  # outputs that are available for action tokens
+_SINGLE_ARM = 7  # numbers of an action for one arm: six for the motion, one for the gripper
 
 
 @dataclass(frozen=True, slots=True)
@@ -588,14 +596,14 @@ class PreparedRow:
     """A valid row, ready for the model."""
 
     row: Row
-    scale: Scale  # scale of the actions of its dataset
+    scale: Scale  # scale of the actions in the row's dataset
     model_input: Any
 
 
 class PrismaticPolicy(ModelPolicy):
     """The base of OpenVLA and OpenVLA-OFT.
 
-    It computes all valid rows of a batch together, each in the units of its own dataset.
+    It computes all valid rows of a batch together. Each row has the units of its own dataset.
     """
 
     config: Any
@@ -603,7 +611,10 @@ class PrismaticPolicy(ModelPolicy):
 
     @abc.abstractmethod
     def _model_input(self, row: Row, key: str) -> Any:
-        """Return the model's input for a row of the dataset `key`; an error fails only that row."""
+        """Return the model's input for a row of the dataset `key`.
+
+        An error affects only this row.
+        """
 
     @abc.abstractmethod
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[Prediction]:
@@ -617,9 +628,7 @@ class PrismaticPolicy(ModelPolicy):
         return info
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        """Compute the chunks of rows; the error of a row that is not valid takes the place of its
-        chunk.
-        """
+        """Compute the chunks of rows. The result of an invalid row is its error."""
 
         def prepare(row: Row) -> PreparedRow:
             key = self._dataset(row)
@@ -629,17 +638,17 @@ class PrismaticPolicy(ModelPolicy):
         return compute_valid([attempt(prepare, row) for row in rows], self._compute)
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
-        """Return a row of any dataset; sessions may select theirs later."""
+        """Return a row of any dataset, since sessions may select their datasets later."""
         row = super()._example(seed, instruction)
         datasets = self._statistics(row.adapter)
         key = self._default_dataset(row.adapter) or datasets.names[0]
         return replace(row, memory={UNNORM_KEY: key})
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Keep the statistics of the adapter's datasets, if its folder has them.
+        """Store the statistics of the adapter's datasets, if the adapter's folder contains them.
 
         Raises:
-            ConfigError: Its actions have other lengths than the base's.
+            ConfigError: The lengths of the adapter's actions differ from the base's.
         """
         if not (folder / STATISTICS_FILE).is_file():
             return
@@ -659,7 +668,8 @@ class PrismaticPolicy(ModelPolicy):
     def _decoded(
         self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, bin_logits: Any
     ) -> list[Prediction]:
-        """Return the chunks of action tokens, with the outputs that their rows request.
+        """Return the chunks that the action tokens represent, with the outputs that the rows
+        request.
 
         Args:
             bins: The bins of the checkpoint.
@@ -687,12 +697,16 @@ class PrismaticPolicy(ModelPolicy):
         return predictions
 
     def _statistics(self, adapter: str = "") -> Statistics:
-        """Return the statistics of an adapter's datasets, or of the base's if it has none."""
+        """Return the statistics of an adapter's datasets, or of the base's datasets if the
+        adapter has none.
+        """
         base: Prismatic = self.loaded().base
         return base.adapter_statistics.get(adapter, base.statistics)
 
     def _default_dataset(self, adapter: str) -> str | None:
-        """Return the dataset in the settings; None for an adapter with its own datasets."""
+        """Return the dataset that the settings select; None for an adapter with its own
+        datasets.
+        """
         if self._statistics(adapter) is not self._statistics():
             return None
         name: str | None = self.config.unnorm_key
@@ -700,7 +714,7 @@ class PrismaticPolicy(ModelPolicy):
 
     def _requested_dataset(self, options: Mapping[str, Any], adapter: str) -> str | None:
         """Return the key of the dataset that a client names in a reset or an observation; None if
-        it names none.
+        the client names no dataset.
         """
         name = options.get(UNNORM_KEY)
         if name is None:
@@ -714,8 +728,8 @@ class PrismaticPolicy(ModelPolicy):
     def _dataset(self, row: Row) -> str:
         """Return the key of a row's dataset.
 
-        It is named by the observation, the reset of the episode or the settings, in this order, or
-        is the only one.
+        The dataset is named in the observation, the reset of the episode or the settings, in this
+        order of priority. Otherwise, it is the only dataset.
         """
         name = (
             self._requested_dataset(row.info, row.adapter)
@@ -725,8 +739,9 @@ class PrismaticPolicy(ModelPolicy):
         return self._statistics(row.adapter).key(name)
 
     def _action(self) -> ActionSpec:
-        """Describe an action: its meaning depends on the dataset, except for the gripper of a
-        single arm.
+        """Describe an action.
+
+        Its meaning depends on the dataset, except for the gripper of a single arm.
         """
         dims: set[int] = set()
         if self.model is not None:
@@ -737,19 +752,20 @@ class PrismaticPolicy(ModelPolicy):
         return ActionSpec(dim=dim)
 
 
-SIDE = 224  # px; the size of all images in OpenVLA's training data
-CROP_AREA = 0.9  # share of the area that training's random crops kept
-_LOBES = 3  # lobes of the Lanczos kernel
+SIDE = 224  # size of all images in OpenVLA's training data, px
+CROP_AREA = 0.9  # share of the area that remains in the random crops of training
+_LOBES = 3  # number of lobes of the Lanczos kernel
 
 
 def resize(image: np.ndarray) -> np.ndarray:
-    """Resize an image as the training data was resized: through JPEG of quality 95, with Lanczos.
+    """Resize an image in the same way as the training data: JPEG compression with quality 95, then
+    Lanczos.
 
     Args:
         image: (H, W, 3) uint8.
 
     Returns:
-        (224, 224, 3) uint8; the image itself if it has that size.
+        (224, 224, 3) uint8, or the image itself if it already has this size.
     """
     height, width = image.shape[:2]
     if (height, width) == (SIDE, SIDE):
@@ -769,7 +785,7 @@ def crop_center(image: np.ndarray) -> np.ndarray:
     """
     height, width = image.shape[:2]
     pixels = _apply(_crop(height), _crop(width), image.astype(np.float32) / 255)
-    return _uint8(pixels * 255.5, 255.5)  # as TensorFlow converts: add a half, then truncate
+    return _uint8(pixels * 255.5, 255.5)  # TensorFlow also adds a half and truncates
 
 
 def _uint8(pixels: np.ndarray, upper: float) -> np.ndarray:
@@ -780,8 +796,8 @@ def _uint8(pixels: np.ndarray, upper: float) -> np.ndarray:
 def _through_jpeg(image: np.ndarray) -> np.ndarray:
     """Compress and decompress the image with the algorithms that TensorFlow uses.
 
-    Its encoder is Pillow's exact one, its decoder the fast one; simplejpeg's encoder differs by up
-    to 18.
+    Its encoder corresponds to Pillow's exact encoder, and its decoder to the fast decoder. The
+    results of simplejpeg's encoder would differ by up to 18.
     """
     file = io.BytesIO()
     require("PIL.Image").fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")
@@ -792,19 +808,21 @@ def _through_jpeg(image: np.ndarray) -> np.ndarray:
 
 
 def _apply(rows: np.ndarray, columns: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Resample an image (H, W, 3) with weights (224, H) of its rows and (224, W) of its columns."""
+    """Resample an image, (H, W, 3), with weights of its rows, (224, H), and of its columns,
+    (224, W).
+    """
     resampled_rows = np.tensordot(rows, image, (1, 0))  # (224, W, 3)
     return np.asarray(np.tensordot(resampled_rows, columns, (1, 1)).transpose(0, 2, 1))
 
 
 @lru_cache(maxsize=16)
 def _lanczos(size: int) -> np.ndarray:
-    """Return weights (224, size) that resize one axis of an image.
+    """Return weights, (224, size), that resize one axis of an image.
 
-    Kernels are wider where the image shrinks, so that it does not alias.
+    The kernels are wider if the image shrinks, to avoid aliasing.
     """
     scale = size / SIDE
-    centres = (np.arange(SIDE) + 0.5) * scale  # in pixels of the original image
+    centres = (np.arange(SIDE) + 0.5) * scale  # position in pixels of the original image
     x = ((np.arange(size) + 0.5) - centres[:, None]) / max(scale, 1.0)
     weights = np.where(np.abs(x) < _LOBES, np.sinc(x) * np.sinc(x / _LOBES), 0.0)
     return np.asarray(weights / weights.sum(1, keepdims=True), np.float32)
@@ -812,11 +830,12 @@ def _lanczos(size: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _crop(size: int) -> np.ndarray:
-    """Return weights (224, size) that scale the centre up, by linear interpolation between the
+    """Return weights, (224, size), that enlarge the centre, with linear interpolation between the
     two nearest pixels.
     """
     side = CROP_AREA**0.5
     start = (1 - side) / 2 * (size - 1)
-    positions = start + np.arange(SIDE) * (side * (size - 1) / (SIDE - 1))  # in original pixels
+    # Position in pixels of the original image.
+    positions = start + np.arange(SIDE) * (side * (size - 1) / (SIDE - 1))
     distances = np.abs(np.arange(size) - positions[:, None])
     return np.asarray(np.maximum(0.0, 1.0 - distances), np.float32)

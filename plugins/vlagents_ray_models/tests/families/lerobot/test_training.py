@@ -316,7 +316,7 @@ def test_a_contract_of_another_width_is_not_used(
     text = torch.tensor(about.to_statistics(9)[STATISTICS][BYTES], dtype=torch.float32)
     save_file(load_file(statistics) | {f"{STATISTICS}.{BYTES}": text}, statistics)
     contract = served(odd).contract
-    assert "has 3 numbers of state, the policy takes 9" in caplog.text
+    assert "has 3 numbers of state, the policy accepts 9" in caplog.text
     assert contract is not None
     assert contract.state == {"joints": StateSpec(9)}
 
