@@ -198,7 +198,7 @@ def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(
     served.learn.commit(1, PushOptions("keep"))  # as if its reply had been lost
     with pytest.raises(
         Overloaded,
-        match="expected a version above 1, the newest here, got 1, as another push was faster",
+        match="expected a version above 1, the newest here, got 1, since another push was faster",
     ):
         served.learn.stage(1, gains(3), PushOptions())
 
