@@ -52,7 +52,7 @@ def test_the_comment_above_a_block_says_how_it_is_tested(
 
 @pytest.mark.parametrize("mark", ["not run", "not run:", "skip", "test: deploy scripted", "tset"])
 def test_an_unknown_mark_is_refused(mark: str) -> None:
-    with pytest.raises(ValueError, match="want 'test'"):
+    with pytest.raises(ValueError, match="expected 'test'"):
         blocks(f"<!-- {mark} -->\n```python\n```\n")
 
 

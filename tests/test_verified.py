@@ -34,7 +34,7 @@ def test_what_is_noted_is_of_tests_that_there_are(family: str) -> None:
         assert not any("failed" in outcomes for outcomes in noted.values())
     for one in verified.notes(family):
         skipped = {name for name, outcomes in one["tests"].items() if "skipped" in outcomes}
-        assert one.get("skipped", {}).keys() == skipped, "without a reason for each"
+        assert one.get("skipped", {}).keys() == skipped, "each skipped test needs a reason"
 
 
 def test_each_page_of_a_family_links_to_what_is_verified_of_it() -> None:

@@ -43,7 +43,7 @@ class Picky(Noop):
             ):
                 raise InvalidObservation("images")
             if one.state["pose"].shape != (9,):
-                raise InvalidObservation("pose: want (9,)")
+                raise InvalidObservation("pose: expected shape (9,)")
         self.seen.append(len(obs))
         return super().act_batch(obs, sessions)
 

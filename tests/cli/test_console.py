@@ -138,9 +138,8 @@ def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.Monke
     policies("noop")
     assert shown.getvalue().splitlines() == [
         (
-            "noop: A policy that does nothing, in an adjustable time, to measure everything around "
-            "a "
-            "policy."
+            "noop: A policy that returns zeros after an adjustable time, to measure the overhead "
+            "around a policy."
         ),
         "  ready",
         "  settings: action_dim=7, delta=None, chunk=1, base_ms=0.0, per_item_ms=0.0",

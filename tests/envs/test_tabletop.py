@@ -212,7 +212,7 @@ def test_the_state_of_the_objects_says_where_the_puck_is_and_where_it_is_to_be(t
         off.append(np.linalg.norm(seen.state["puck"] - seen.state["target"]))
     assert off[0] > 0.07
     assert off[-1] < 0.06, (
-        "within the pad, on the other puck, or somewhat higher than it had to be lifted"
+        "the puck must be within the pad, on the other puck, or slightly above the required height"
     )
 
 

@@ -97,7 +97,7 @@ def test_its_sessions_go_on_elsewhere_the_cause_is_told_and_it_is_replaced(
         thread.start()
     wait_for(lambda: not any(thread.is_alive() for thread in threads))
     print(
-        f"{how}: {len(hit)} sessions were there; the last acted elsewhere after "
+        f"{how}: {len(hit)} sessions were on this replica; the last acted elsewhere after "
         f"{time.monotonic() - begun:.1f} s"
     )
     if how == "sleep":

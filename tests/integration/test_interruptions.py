@@ -246,7 +246,9 @@ def test_robots_act_again_soon_and_no_act_is_doubled_or_late(
         for process in {pid for _, pid, _ in acts}:
             numbers = [number for number, pid, _ in acts if pid == process]
             doubled = {number for number, times in Counter(numbers).items() if times > 1}
-            assert doubled <= robot.resumed, f"{robot.name}: doubled {doubled - robot.resumed}"
+            assert doubled <= robot.resumed, (
+                f"{robot.name}: executed twice: {doubled - robot.resumed}"
+            )
     for route, gap_s in gaps_s.items():
         assert gap_s < bound_s(route, fault), f"{fault}: no action for: {shown}"
 

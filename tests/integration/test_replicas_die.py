@@ -162,7 +162,7 @@ def test_killed_and_frozen_replicas_lose_double_cross_and_delay_no_act(
         ]
         took[fault].append(max(call.ended for call in elsewhere) - begun)
         print(
-            f"{fault.name}: {len(hit)} of {SESSIONS} sessions were there; the last acted after "
+            f"{fault.name}: {len(hit)} of {SESSIONS} sessions were on this replica; the last acted again after "
             f"{took[fault][-1]:.2f} s"
         )
         if fault is signal.SIGSTOP:

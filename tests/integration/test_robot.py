@@ -175,7 +175,7 @@ def test_a_killed_replica_and_a_restarted_server_cost_safe_ticks_and_nothing_els
             until=lambda: time.monotonic() > deadline or next(script, True),
             options=LoopOptions(restart="auto"),
         )
-        assert next(script, True), f"no resumption: {report}"
+        assert next(script, True), f"the session was not resumed: {report}"
     # In both cases the server was down for longer than a chunk lasts.
     assert report.safe_ticks > 2 * ROWS
     assert seen.longest_s < 5.0, "a tick waited for the server's restart"

@@ -74,7 +74,7 @@ def command(*words: str, start_new_session: bool = False) -> Iterator[subprocess
         names = [p.name() for p in alive]
         for p in alive:
             p.kill()
-        assert not names, f"left running: {names}"
+        assert not names, f"processes still running: {names}"
 
 
 def test_the_port_is_closed_while_the_policy_loads_and_clients_wait_for_it(tmp_path: Path) -> None:

@@ -68,12 +68,12 @@ def test_a_planner_that_ends_leaves_the_policy_its_subtask_and_then_the_robot_ho
     assert held >= 20, "the robot holds from 3 s after the planner's last answer"
     # Until then the policy continued with the last subtask, for about 3 + 3 s of the 12 s.
     assert report.jitter["ticks"] - report.safe_ticks >= 40
-    assert "lost" not in report.safe, "the policy's server answered all the time"
+    assert "lost" not in report.safe, "the policy's server must answer all the time"
 
 
 def test_a_policy_that_ends_is_named_by_its_own_reason(server: Server) -> None:
     report = drive_until_down(server, "policy", max_age_s=5.0)
-    assert "robot" not in report.safe, "the planner answered all the time"
+    assert "robot" not in report.safe, "the planner must answer all the time"
     assert report.safe_ticks >= 40
     assert any(cause in report.reasons for cause in ("lost", "failed", "waiting")), report.reasons
     assert not any(reason.startswith("planner") for reason in report.reasons.values())

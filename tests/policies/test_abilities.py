@@ -234,7 +234,7 @@ def test_a_property_of_an_ability_is_not_evaluated() -> None:
     class Remote(Plain):
         @property
         def continues_plans(self) -> bool:
-            raise TimeoutError("no answer of the server")
+            raise TimeoutError("no answer from the server")
 
     agent = Remote()
     assert ability(Same(agent), ContinuesPlans) is agent

@@ -50,7 +50,7 @@ def test_the_expert_takes_over_once_and_solves_each_recorded_episode(data: Path)
         assert led[-1]
         begun.append(led.index(True))
         assert (steps[begun[-1]].obs.gripper or 0) > 0.9
-    assert len(set(begun)) > 1, "at different ticks"
+    assert len(set(begun)) > 1, "the corrections must begin at different ticks"
 
 
 def test_training_goes_on_from_the_checkpoint_with_the_experts_frames_alone(

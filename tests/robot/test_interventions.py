@@ -129,7 +129,7 @@ def test_pauses_are_counted_apart_from_ticks_that_the_policy_missed(clock: Simul
 
         report = run_loop(arm, player, hz=HZ, until=over)
     assert (report.paused, report.safe, report.waiting, report.mostly_safe) == (35, {}, 0, None)
-    assert len(arm.commanded) == 5, "a paused robot gets no command"
+    assert len(arm.commanded) == 5, "a paused robot must get no command"
 
 
 def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:

@@ -93,11 +93,11 @@ def test_the_table_names_every_endpoint(replica: KeyedReplica) -> None:
     }
     new = routes - {"/openapi.json"} - named - {f"/v1/{op}" for op in OPS}
     assert not new, (
-        "ATTEMPTS of tests/support/api_key_replica.py tries them, docs/access.md has their cells"
+        "add new endpoints to ATTEMPTS in tests/support/api_key_replica.py and to docs/access.md"
     )
     with_ports = {"gr00t", "vlagents", "lerobot", "lerobot_remote"}
     assert set(names("dialects")) == {*ALL, *with_ports}, (
-        "`keyed_replica` serves a new one, ATTEMPTS tries it"
+        "add a new dialect to `keyed_replica` and to ATTEMPTS"
     )
 
 

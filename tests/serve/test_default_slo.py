@@ -111,5 +111,5 @@ def test_the_setting_reaches_the_engine_and_the_metadata() -> None:
     assert ServerArgs(**args.model_dump(mode="json")).slo == args.slo
     policy.initialize()
     assert policy.metadata["slo"] == OF_FILE.to_json()
-    assert SLO not in policy.reset(Obs(), None), "its sessions are simulations"
+    assert SLO not in policy.reset(Obs(), None), "the key's sessions must be simulations"
     policy.close()

@@ -148,7 +148,7 @@ def test_serve_leaves_a_replica_that_does_not_answer_as_much_time_as_a_call_may_
     """The policy may hold the GIL meanwhile. Only Serve's checks limit this time."""
     policy = application(ServerArgs(policy="noop", limits={"act_s": act_s}))._bound_deployment
     assert policy._deployment_config.max_constructor_retry_count == 1, (
-        "it gives up after the first failed start"
+        "Serve must give up after the first failed start"
     )
     silent_s = 3 * policy._deployment_config.health_check_timeout_s
     assert act_s <= silent_s <= max(15.0, act_s)

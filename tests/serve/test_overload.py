@@ -865,7 +865,7 @@ def test_the_messages_of_a_key_over_its_rate_stay_unread_at_uvicorns_websockets(
     caller.take_request()
     with pytest.raises(TooManyRequests):
         caller.take_request()
-    assert _part(client, STREAM_BYTES) > STREAM_BYTES / 4, "the kernel's buffers hold 10 MB"
+    assert _part(client, STREAM_BYTES) > STREAM_BYTES / 4, "the kernel's buffers contain 10 MB"
     replica.known.change(visitor.name, rate=None)
     client.close()
     # The server now reads the bytes in these buffers, which takes memory.

@@ -106,9 +106,7 @@ def test_servers_that_start_at_once_get_different_blocks(monkeypatch: pytest.Mon
 
 
 @pytest.mark.usefixtures("claims")
-@pytest.mark.skipif(
-    os.getuid() != 0, reason="another account is needed, which only root can act as"
-)
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another account")
 @pytest.mark.parametrize("listens", ["", "s.listen(0);"], ids=["bound", "listening"])
 def test_another_account_cannot_claim_all_ports(
     listens: str, monkeypatch: pytest.MonkeyPatch

@@ -132,8 +132,8 @@ class Robot:
             )
         if [one for one in ids if one not in self.uncertain] != expected:
             raise Violation(
-                f"{expected[-1]}: acts were lost or doubled: {ids}, want {expected} and some of "
-                f"{self.uncertain}"
+                f"{expected[-1]}: acts were lost or doubled: expected {expected} and some of "
+                f"{self.uncertain}, got {ids}"
             )
 
     async def _ask(self, op: str, instruction: str, name: str | None) -> Reply | None:

@@ -391,7 +391,7 @@ def start_at_once(costs: CostCurve, number: int, slack: bool, *kinds: tuple[int,
 
 def print_starts() -> None:
     """Print the late ticks of robots that all begin at the same time."""
-    print("robots  rows     slack  starved s a robot (mean, most)  s until none is starved")
+    print("robots  rows     slack  starved s per robot (mean, most)  s until none is starved")
     for kinds, numbers in (
         (((50, 10.0),), (64, 128, 192, 256, 320, 400)),
         (((8, 10.0),), (16, 32, 40)),
@@ -405,7 +405,7 @@ def print_starts() -> None:
             in_time = sum(robot.starved <= 0.02 * robot.ticks for robot in robots)
             print(
                 f"{number:6}  {rows:8} {slack!s:6} {sum(starved_s) / number:6.2f} "
-                f"{max(starved_s):6.2f}  {last_s:6.1f}  {in_time} with 98 % of a minute",
+                f"{max(starved_s):6.2f}  {last_s:6.1f}  {in_time} robots in time for 98 % of a minute",
                 flush=True,
             )
 
@@ -530,10 +530,18 @@ def main() -> None:
     """Run seeds, or print the largest fleets."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=0, help="number of worlds to run")
-    parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--fleets", action="store_true", help="print the largest fleets in time")
-    parser.add_argument("--starts", action="store_true", help="print starts of all robots at once")
-    parser.add_argument("--overload", action="store_true", help="print starts and overload")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument(
+        "--fleets", action="store_true", help="print the largest fleets that are in time"
+    )
+    parser.add_argument(
+        "--starts", action="store_true", help="print fleets whose robots all start at once"
+    )
+    parser.add_argument(
+        "--overload",
+        action="store_true",
+        help="print fleets that start at once, and fleets that are too large",
+    )
     options = parser.parse_args()
 
     began = time.monotonic()

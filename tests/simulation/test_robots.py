@@ -106,7 +106,7 @@ def test_a_robot_without_an_slo_is_paced_by_what_it_does() -> None:
     needs = {robot.plan.need for robot in robots}
     assert all(need is not None and need.rows == 50 for need in needs)
     assert all(need is not None and abs(need.hz - 10.0) <= 1.0 for need in needs)
-    assert world.queue.depth() <= 32, "they wait at home, not in the queue"
+    assert world.queue.depth() <= 32, "robots must wait before they send, not in the queue"
 
 
 @pytest.mark.parametrize("states_slo", [True, False])

@@ -48,7 +48,7 @@ class Told(Agent):
 
     def act(self, obs: Obs) -> Act:
         if obs.info.get("fail"):
-            raise RuntimeError("as it was told")
+            raise RuntimeError("as requested")
         time.sleep(float(obs.info.get("sleep_s", 0.0)))
         gripper = -1.0 if obs.gripper is None else obs.gripper
         front = float(obs.cameras["front"].mean()) if "front" in obs.cameras else -1.0

@@ -1,4 +1,4 @@
-"""The calls of torch in an act of π0 or π0.5 of the published size, on the device meta."""
+"""The torch calls in an act of π0 or π0.5 with the published size, counted on the device meta."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch_calls import META, TorchCalls
 
 ROWS, CAMERAS, STEPS = 2, 3, 10
 SIDE = 224  # px
-STATE = 32  # numbers, as of an action
+STATE = 32  # length of a state and of an action
 
 
 @dataclass(frozen=True)
 class FlowCalls:
-    """The calls of an act, or its launches of kernels."""
+    """The number of calls of an act, or of its kernel launches."""
 
     prefix: int
     once: int  # what is the same in all steps, or follows from their times
@@ -23,7 +23,7 @@ class FlowCalls:
 
     @property
     def chunk(self) -> int:
-        """Those of a chunk of `STEPS` steps."""
+        """The number of calls of a chunk with `STEPS` steps."""
         return self.prefix + self.once + STEPS * self.step
 
 
@@ -32,12 +32,14 @@ def calls_of_flow(passes: Any, *, words: int, horizon: int, dtype: Any) -> dict[
 
     Args:
         passes: The `Pi0HfPasses` or `Pi0Passes` of a network on the device meta.
-        words: The number of tokens of an instruction; transformers' have those of images as well.
+        words: The number of tokens of an instruction; for a `Pi0HfPasses`, including those of
+            images.
         horizon: The number of rows of a chunk.
         dtype: The type of states and images.
 
     Returns:
-        "calls", of ATen, and "launches", where functions with a kernel for CUDA count once.
+        "calls", the number of ATen calls, and "launches", in which a function with its own CUDA
+        kernel counts once.
     """
 
     def empty(*shape: int, dtype: Any = dtype) -> Any:

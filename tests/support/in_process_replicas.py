@@ -138,7 +138,7 @@ class InProcess:
                     "protocol": PROTOCOL_VERSION,
                     "contract": contract.to_json() if contract else None,
                 }
-        raise PolicyUnavailable("no replica lives")
+        raise PolicyUnavailable("no replica is alive")
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Send a frame and return its replies."""

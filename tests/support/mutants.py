@@ -380,7 +380,7 @@ def main() -> None:
 
         how, test = play(copies.get(), sorted(killers), options.python, options.limit_s)
         if how != "survived":
-            print(f"does not pass without a change: {test}")
+            print(f"a test fails without a mutation: {test}")
 
 
 if __name__ == "__main__":

@@ -202,7 +202,7 @@ class _Refusal(Loader):
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         raise ModuleNotFoundError(
-            f"{spec.name}: the test is not marked `sim` or `torch`", name=spec.name
+            f"{spec.name}: blocked, since the test is not marked `sim` or `torch`", name=spec.name
         )
 
 

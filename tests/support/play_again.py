@@ -33,7 +33,12 @@ def main(arguments: list[str]) -> int:
         # A server that did not start makes all tests of a file fail.
         if len({name.partition("::")[0] for name in failed}) > _MOST:
             return status
-        print(f"== {len(failed)} failed; once more, alone", *failed, sep="\n  ", flush=True)
+        print(
+            f"== {len(failed)} tests failed; running them once more, alone",
+            *failed,
+            sep="\n  ",
+            flush=True,
+        )
         again = subprocess.run([*command, *failed], check=False).returncode
         still_failed = set(json.loads(failed_tests.read_text())) if failed_tests.exists() else set()
         for name in sorted(set(failed) - still_failed):

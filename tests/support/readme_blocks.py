@@ -1,24 +1,27 @@
-"""Reading, running and checking the fenced blocks of a Markdown text, its commands, and the files
-of examples/.
+"""Read, run and check the blocks of a Markdown text, its commands, and the files of examples/.
 
-An HTML comment straight above a block says how it is tested. `<!-- test: serve scripted -->` runs
-it with a server of that policy in place of http://gpu-box:8000 or http://localhost:8000, `<!-- test
--->` or no comment without one; ` with peers` at the end of either runs it with the Python that has
-other systems' clients, and ` with ray` says of a block of docs/ that it starts Ray.
-Further lines of such a comment are code that is run before the block:
+An HTML comment directly above a block defines its test:
+
+- `<!-- test: serve scripted -->` runs the block with a server of that policy in place of
+  http://gpu-box:8000 or http://localhost:8000.
+- `<!-- test -->`, or no comment, runs it without a server.
+- ` with peers` at the end of either runs it with the Python that has other systems' clients.
+- ` with ray` marks a block of docs/ that starts Ray.
+
+Further lines of such a comment are code that runs before the block:
 
     <!-- test: serve scripted
     obs = Obs(gripper=1.0) -->
 
-`<!-- output -->` above a block of text says that the block before it prints these lines, in this
-order and perhaps among others. Numbers are not compared, and `…` matches any text.
+`<!-- output -->` above a block of text means that the block before it prints these lines, in this
+order and possibly among others. Numbers are not compared, and `…` matches any text.
 
-`<!-- file: NAME -->` says that the reader saves the block, of whatever language, under that name;
-the blocks after it on the page find the file.
+`<!-- file: NAME -->` means that the reader saves the block, in any language, under that name. Later
+blocks on the page find the file.
 
-`<!-- not run: REASON -->` says why a block is not run; its commands must at least exist, and
-`vlagents-ray`'s must know their options. Where blocks run, an `sbatch` takes every job and runs
-none.
+`<!-- not run: REASON -->` gives the reason why a block is not run. Its commands must at least
+exist, and commands of `vlagents-ray` must have the shown options. Where blocks run, `sbatch` is a
+stand-in that accepts every job and runs none.
 """
 
 from __future__ import annotations
@@ -45,19 +48,20 @@ ROOT = Path(__file__).parents[2]
 DOCUMENTED_HOST = "gpu-box:8000"
 ON_THIS_MACHINE = "localhost:8000"
 PYTHON, SHELL = {"python"}, {"bash", "sh", "console"}
-# As a reader has it, without PYTHONPATH; but if that names this checkout, another one may be what
-# is installed.
+# The environment of a reader, without PYTHONPATH. But if PYTHONPATH contains this checkout, it is
+# kept, since another checkout may be installed.
 _HERE = (
     {"PYTHONPATH": str(ROOT)}
     if str(ROOT) in os.environ.get("PYTHONPATH", "").split(os.pathsep)
     else {}
 )
 _READERS = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | _HERE
-_BIN = Path(__file__).parent / "bin"  # commands that a reader has, and this machine may not
+# stand-ins for commands that a reader has, but possibly not this machine
+_BIN = Path(__file__).parent / "bin"
 ENV = _READERS | {
     "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
     "RAY_USAGE_STATS_ENABLED": "0",
-    "COLUMNS": "300",  # so that --help does not cut names off
+    "COLUMNS": "300",  # wide enough that --help does not truncate names
     "TERM": "dumb",
 }
 RUN_S = 300
@@ -65,18 +69,18 @@ RUN_S = 300
 
 @dataclass(frozen=True)
 class Block:
-    """One fenced block. `source` has its code, and its comment's, at the lines of the README
-    where they stand.
+    """One fenced block. `source` has the code of the block and of its comment, at the same line
+    numbers as on the page.
     """
 
     language: str
     line: int
     source: str
-    server: str | None = None  # the policy that must be served meanwhile
-    not_run: str | None = None  # why it is not run
-    peers: bool = False  # it is for the peers' Python
-    ray: bool = False  # it starts Ray
-    file: str | None = None  # under which name it is saved, in place of being run
+    server: str | None = None  # the policy that must be served while it runs
+    not_run: str | None = None  # the reason if it is not run
+    peers: bool = False  # whether it needs the Python of the peers' environment
+    ray: bool = False  # whether it starts Ray
+    file: str | None = None  # the name under which it is saved instead of being run
     output: str = ""  # the part of its output that the page shows
 
     def __str__(self) -> str:
@@ -84,8 +88,8 @@ class Block:
 
 
 def blocks(text: str) -> list[Block]:
-    """The Python and shell blocks of a Markdown text. Raises `ValueError` for an unknown or
-    unfinished one.
+    """Return the Python and shell blocks of a Markdown text. Raise `ValueError` for an unknown mark
+    or an unfinished block.
     """
     found: list[Block] = []
     fence: re.Match[str] | None = None
@@ -135,10 +139,10 @@ def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, st
         server, peers, ray = match[1], match[2] is not None, match[3] is not None
     else:
         raise ValueError(
-            f"line {above[0][0]}: {mark!r}, want 'test', 'test: serve POLICY' ('with peers', 'with "
-            "ray'), 'file: NAME' or 'not run: REASON'"
+            f"line {above[0][0]}: expected 'test', 'test: serve POLICY' ('with peers', 'with "
+            "ray'), 'file: NAME' or 'not run: REASON', got {mark!r}"
         )
-    if language == "console":  # what begins with a prompt was typed, the rest is output
+    if language == "console":  # lines with a prompt are input, the remaining ones are output
         code = [(number, line[2:]) for number, line in code if line.startswith("$ ")]
     kept = dict([*setup, *code])
     first = code[0][0] if code else above[0][0] if above else 0
@@ -147,8 +151,8 @@ def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, st
 
 
 def checkout(folder: Path) -> None:
-    """Copy the folders of a checkout that pages name into `folder`. Evaluations of the examples get
-    two episodes of each environment, and one worker.
+    """Copy the folders of a checkout that pages mention into `folder`. Evaluations of the examples
+    get two episodes of each environment, and one worker.
     """
     for name in ("cluster", "deployments", "examples"):
         shutil.copytree(ROOT / name, folder / name)
@@ -165,7 +169,7 @@ def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST, *, page: str = "RE
     if block.file is not None:
         (cwd / block.file).write_text(source.lstrip())
         return
-    # not onnx.py, which would hide the package
+    # not onnx.py, for example, which would hide the package
     script = cwd / f"{page}_page.{'py' if block.language in PYTHON else 'sh'}"
     env = ENV | {"PATH": f"{_BIN}{os.pathsep}{ENV['PATH']}", "HOME": str(cwd)}
     script.write_text(source)
@@ -195,8 +199,7 @@ def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST, *, page: str = "RE
 def not_printed(shown: str, printed: str) -> str | None:
     """Return the first line of `shown` that `printed` does not have after the lines before it.
 
-    Spaces are not compared, and of numbers only their places: a page shows one run, and another has
-    other times.
+    Spaces and the values of numbers are not compared, since times differ between runs.
     """
     remaining = iter(_without_numbers(printed))
     for line in _without_numbers(shown):
@@ -207,8 +210,8 @@ def not_printed(shown: str, printed: str) -> str | None:
 
 
 def _without_numbers(text: str) -> list[str]:
-    """Return the lines of a text that are not empty, with 0 for each number, and the singular of a
-    noun behind it.
+    """Return the lines of a text that are not empty, with 0 for each number, and with the noun
+    after a number in the singular.
     """
     lines = [re.sub("─+", "─", " ".join(line.split())) for line in text.splitlines()]
     without = [re.sub(r"\d[\d.,]*(e[-+]\d+)?", "0", line) for line in lines if line]
@@ -216,8 +219,8 @@ def _without_numbers(text: str) -> list[str]:
 
 
 def check_commands(block: Block) -> None:
-    """Every command of a shell block that is not run is there, and takes the options that are
-    shown.
+    """Check that each command of a shell block that is not run exists, and accepts the shown
+    options.
     """
     parsed = subprocess.run(
         ["bash", "-n"], input=block.source, check=False, capture_output=True, text=True
@@ -226,7 +229,7 @@ def check_commands(block: Block) -> None:
     for line in block.source.replace("\\\n", " ").splitlines():
         words = shlex.split(line, comments=True)
         while words and re.match(r"\w+=", words[0]):
-            words.pop(0)  # FOO=bar command
+            words.pop(0)  # an assignment in front of the command, as in FOO=bar command
         if words:
             check_command(words, f"README {block}: {line.strip()}")
 
@@ -240,7 +243,7 @@ def check_command(words: list[str], where: str) -> None:
     else:
         command = ["bash", "-c", f"type {shlex.quote(name)}"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=ENV, timeout=60)
-    # A command of commands, as `bench` is.
+    # A group of commands, such as `bench`.
     if name == "vlagents-ray" and re.search(r"Usage:.*COMMAND", done.stdout):
         command = [name, *arguments[:2], "--help"]
         done = subprocess.run(
@@ -257,13 +260,13 @@ def check_command(words: list[str], where: str) -> None:
 
 DOCS = ROOT / "docs"
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
-COMMAND: Any = get_command(app)  # command of click, or of what typer has of it
+COMMAND: Any = get_command(app)  # the main command, as a click command made by typer
 PAGES = sorted([ROOT / "README.md", ROOT / "SECURITY.md", *DOCS.rglob("*.md")])
 
 
 def commands(text: str) -> list[tuple[str, bool]]:
-    """The commands of `vlagents-ray` in a page, and whether one stands in a block, whole, and
-    not in a sentence.
+    """Return the commands of `vlagents-ray` in a page. The flag is true for a complete command in a
+    block, and false for a command in a sentence.
     """
     blocks = re.findall(r"```(?:bash|sh|console)\n(.*?)```", text, re.DOTALL)
     lines = [
@@ -278,7 +281,7 @@ def commands(text: str) -> list[tuple[str, bool]]:
 
 
 def options_of(line: str) -> set[str]:
-    """The options of the command that a line begins with, and of those below it."""
+    """Return the options of the command with which a line begins, and of its subcommands."""
     words = line.split()
     words = words[words.index("vlagents-ray") + 1 :]
     if words[:1] == ["robot"]:
@@ -297,12 +300,12 @@ def options_of(line: str) -> set[str]:
 
 
 def read_as_typed(line: str, *, whole: bool) -> None:
-    """Raise what the command would say of its words before it does anything; of a mention some
-    may be left out.
+    """Raise the error with which the command would reject its arguments. A command in a sentence
+    may lack required arguments.
     """
     if not whole:
-        line = re.sub(r"[\[\]…]", "", line)  # what is optional, and what is anything
-    words = re.split(r" (?:\d?>|\||&)", line)[0]  # what the shell reads
+        line = re.sub(r"[\[\]…]", "", line)  # brackets of optional arguments, and ellipses
+    words = re.split(r" (?:\d?>|\||&)", line)[0]  # without pipes and redirections of the shell
     arguments = shlex.split(words, comments=True)
     arguments = arguments[arguments.index("vlagents-ray") + 1 :]
     command = COMMAND
@@ -327,14 +330,14 @@ EXAMPLES = ROOT / "examples"
 
 
 def code_of(notebook: Path, server: str | None = None) -> Block:
-    """The cells of a notebook in their order, as one block of Python; raises `ValueError` if it
-    has outputs.
+    """Return the cells of a notebook in order, as one block of Python; raise `ValueError` if it has
+    outputs.
     """
     cells = [
         cell for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"
     ]
     if kept := [cell["id"] for cell in cells if cell["outputs"] or cell["execution_count"]]:
-        raise ValueError(f"{notebook.name}: got outputs in {kept}, want none; clear them")
+        raise ValueError(f"{notebook.name}: expected no outputs, got some in {kept}; clear them")
     code = "\n".join("".join(cell["source"]) for cell in cells).replace(
         "localhost:8000", DOCUMENTED_HOST
     )

@@ -1,4 +1,4 @@
-"""The functions that programs of `torch.compile` call, without compiling them."""
+"""Records the functions that programs of `torch.compile` call, without compiling them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vlagents_ray.policies.compilation import Compilation
 
 @contextmanager
 def recorded_programs(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[list[str]]]:
-    """Run the graphs that torch traces as they are, in the context.
+    """Run the graphs that torch traces without compilation, during the context.
 
     Returns:
-        For each program, the names of the functions that it calls.
+        For each program, the list of the functions that it calls.
     """
     programs: list[list[str]] = []
 

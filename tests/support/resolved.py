@@ -237,7 +237,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=["extras", "locks"])
     parser.add_argument(
-        "only", nargs="*", metavar="NAME", help="an extra or a lock; all without one"
+        "only", nargs="*", metavar="NAME", help="extra or lock to update; all by default"
     )
     arguments = parser.parse_args()
     if arguments.what == "extras":

@@ -19,5 +19,7 @@ def check_rounding(ours: np.ndarray, theirs: np.ndarray, exact: np.ndarray) -> N
     our_error, their_error = (
         float(np.linalg.norm(actions - exact) / np.linalg.norm(exact)) for actions in (ours, theirs)
     )
-    print(f"relative error {our_error:.5f}, of the authors' own passes {their_error:.5f}")
+    print(
+        f"expected a relative error near that of the authors' passes, {their_error:.5f}, got {our_error:.5f}"
+    )
     assert 0 < our_error <= _AS_LARGE * their_error

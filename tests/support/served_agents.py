@@ -258,9 +258,10 @@ class Ticking(Agent):
 
 
 class Witness(Agent):
-    """An action that tells what was seen: a pixel of the first camera, the first state, the
-    gripper, the length of the
-    instruction, and which act of its session it is. Two rows, the second with the next number."""
+    """A policy whose action has a pixel of the first camera, the first state, the gripper, the
+    length of the instruction, and the number of the act in its session. It returns two rows; the
+    second has the next number.
+    """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
         self.instruction, self.acts = instruction or "", 0
@@ -359,8 +360,9 @@ class TwoArms(Mirror):
 
 
 class Stored(Agent):
-    """Its checkpoint is a file with a number, which its actions tell. Loads while there is no
-    file "….held" beside it, and leaves "….begun" and "….closed"."""
+    """A policy whose checkpoint is a file with a number, which its actions contain. It waits to
+    load while the file "….held" exists next to it, and creates the files "….begun" and "….closed".
+    """
 
     def __init__(
         self, checkpoint: str, checkpoint_step: int | None = None, scale: float = 1.0

@@ -68,7 +68,7 @@ class Fragile(EvalEnv):
         if seed % 3 == 1 and self._trouble == "reset raises":
             raise RuntimeError("the assets of this scene are missing")
         if seed % 3 == 1 and self._trouble == "reset refuses":
-            raise InvalidAction("action: got one that settles nothing")
+            raise InvalidAction("action: expected one with which the scene settles")
         if seed % 3 == 1 and self._trouble == "reset sees nothing":
             return self._look(np.nan), {}
         return self._look(), {}
@@ -80,7 +80,7 @@ class Fragile(EvalEnv):
         if abs(act.action[0]) > _LIMIT:
             if self._trouble == "refuses":
                 raise InvalidAction(
-                    f"action: got {act.action[0]}, want a finite number of at most {_LIMIT}"
+                    f"action: expected a finite number of at most {_LIMIT}, got {act.action[0]}"
                 )
             if self._trouble in EXPLOSIONS:
                 raise EXPLOSIONS[self._trouble]

@@ -134,7 +134,7 @@ def test_the_report_shows_rates_and_what_was_not_the_policys_fault(summary: Summ
     assert "1 attempts lost to infrastructure and repeated" in text
     assert "1 episodes lost to infrastructure" in text
     assert "--resume" in text
-    assert not any(word in text for word in ("report:", "busy")), "there is none"
+    assert not any(word in text for word in ("report:", "busy")), "these lines must be absent"
     page = write_report(summary.results, Path(summary.out) / "report.html")
     assert f"report: {page}" in printed(summary)
 
