@@ -312,6 +312,9 @@ def ray_cluster(
 
 
 def _ray_start(host: Host, how: Sequence[str], cpus: float, options: Mapping[str, str]) -> None:
+    # A log monitor would send what workers print to drivers, which here read no logs: a second of
+    # CPU time for each host.
+    options = {"include_log_monitor": "false", **options}
     command = ["env", "-u", "RAY_ADDRESS", "ray", "start", *how, "--disable-usage-stats"]
     command += [f"--node-ip-address={host.address}", f"--num-cpus={cpus:g}"]
     host.run([*command, *(f"--{key.replace('_', '-')}={value}" for key, value in options.items())])
