@@ -85,6 +85,17 @@ def test_the_public_names_import_nothing_heavy() -> None:
     assert loaded_by("from vlagents_ray import Act, Agent, Obs, RemoteAgent") & HEAVY == set()
 
 
+def test_the_help_of_the_commands_needs_neither_arrays_nor_connections() -> None:
+    """A shell waits for it, and so does each command that only reads or writes a file."""
+    unneeded = {"asyncio", "numpy", "simplejpeg", "websockets", "yaml"} | HEAVY
+    assert loaded_by("import vlagents_ray.cli.main") & unneeded == {"pydantic", "rich", "typer"}
+
+
+def test_what_an_evaluation_asks_of_a_job_is_computed_without_ray() -> None:
+    statement = "from vlagents_ray.evaluate import EvalConfig, most_cpus, most_gpus"
+    assert loaded_by(statement) & {"ray", "torch"} == set()
+
+
 def test_a_heavy_import_would_be_seen() -> None:
     assert "pydantic" in loaded_by("import vlagents_ray, pydantic") & HEAVY
 

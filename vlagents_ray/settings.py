@@ -5,11 +5,10 @@ from __future__ import annotations
 import datetime
 import inspect
 import numbers
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
-
-import numpy as np
 
 from vlagents_ray.errors import ConfigError, shown
 from vlagents_ray.naming import did_you_mean
@@ -30,10 +29,10 @@ _SPELLINGS = {
     ("string_type", datetime.date): "; put it in quotation marks",
 }
 _EXPECTED = "Input should be "  # beginning of pydantic's messages
-# The types of values that each plain type allows. numpy's types are allowed, and whole numbers are
-# allowed for a float, since YAML reads 1 as int.
+# The types of values that each plain type allows. numpy's numbers are allowed, and whole numbers
+# are allowed for a float, since YAML reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
-    bool: (bool, np.bool_),
+    bool: (bool,),
     int: (numbers.Integral,),
     float: (numbers.Real,),
     str: (str,),
@@ -102,7 +101,13 @@ def _type_of_default(default: object) -> Any:
 
 
 def _is_of_kind(value: object, kind: type) -> bool:
-    """Return whether a value is of a plain type; a boolean does not count as a number."""
+    """Return whether a value is of a plain type, which includes numpy's; a boolean does not count
+    as a number.
+    """
+    # Not imported for this: without numpy there is no such value.
+    numpy = sys.modules.get("numpy")
+    if kind is bool and numpy is not None and isinstance(value, numpy.bool_):
+        return True
     return isinstance(value, _PLAIN[kind]) and (kind is bool or type(value) is not bool)
 
 

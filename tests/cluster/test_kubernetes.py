@@ -26,8 +26,8 @@ from typer.testing import CliRunner
 from benchmarks.hosts import HostFailed, hosts, ray_cluster
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig
-from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
 from vlagents_ray.serve.access.key_store import new_key
+from vlagents_ray.serve.access.variables import FILE_VARIABLE
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 from vlagents_ray.serve.launch.haproxy import ROBOTS

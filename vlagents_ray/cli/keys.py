@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.text import Text
@@ -13,8 +13,10 @@ from rich.text import Text
 from vlagents_ray.cli.console import err, errors, out, table
 from vlagents_ray.cli.options import finite
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
-from vlagents_ray.serve.access.key_store import Key, new_key, read_keys, revoke
+from vlagents_ray.serve.access.variables import FILE_VARIABLE
+
+if TYPE_CHECKING:
+    from vlagents_ray.serve.access.key_store import Key
 
 keys = typer.Typer(no_args_is_help=True, help="Create, list and revoke the API keys of a server.")
 File = Annotated[
@@ -91,6 +93,8 @@ def create(
     ] = None,
 ) -> None:
     """Create a key, and print it. It is not shown again, as the file contains only its hash."""
+    from vlagents_ray.serve.access.key_store import new_key
+
     with errors():
         expires = None if days is None else time.time() + days * 86_400
         path = _path(file)
@@ -110,6 +114,8 @@ def create(
 @keys.command("list")
 def list_(file: File = None) -> None:
     """List the keys with their permissions and limits."""
+    from vlagents_ray.serve.access.key_store import read_keys
+
     with errors():
         listed = table("name", "for", "requests/s", "sessions", "priority", "may also", "state")
         for key in read_keys(_existing(file)):
@@ -130,6 +136,8 @@ def revoke_(name: Name, file: File = None) -> None:
     """Revoke a key. Running servers reject it within seconds, and close the connections that use
     it.
     """
+    from vlagents_ray.serve.access.key_store import revoke
+
     with errors():
         revoke(_existing(file), name)
         out.print(f"key {name} revoked")

@@ -212,7 +212,7 @@ def _serve_on_ray(
     replica_per_gpu: bool,
 ) -> contextlib.AbstractContextManager[Any]:
     """Return the context in which Ray serves the policies."""
-    from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
+    from vlagents_ray.evaluate.plan.cases import most_cpus, most_gpus
     from vlagents_ray.serve.launch.server import running_server, spread_over_gpus
 
     workers = max(1, plan.workers)

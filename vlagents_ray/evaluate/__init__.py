@@ -37,6 +37,7 @@ from vlagents_ray.evaluate.results.statistics import (
 from vlagents_ray.evaluate.results.summary import Group, Summary
 
 if TYPE_CHECKING:
+    from vlagents_ray.evaluate.plan.cases import most_cpus, most_gpus
     from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
     from vlagents_ray.evaluate.report.terminal import (
         Progress,
@@ -45,13 +46,12 @@ if TYPE_CHECKING:
         results_table,
     )
     from vlagents_ray.evaluate.run import EvaluationInterrupted, OutOfTime, check, evaluate
-    from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
 
 _LATE = {
+    "plan.cases": ("most_cpus", "most_gpus"),
     "plan.resolved": ("ResolvedPlan", "resolve"),
     "report.terminal": ("Progress", "print_summary", "progress_for", "results_table"),
     "run": ("EvaluationInterrupted", "OutOfTime", "check", "evaluate"),
-    "workers.cluster": ("most_cpus", "most_gpus"),
 }  # module -> names that are imported from it on first use
 
 __all__ = [

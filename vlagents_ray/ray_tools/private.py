@@ -9,7 +9,6 @@ Serve sends that module by value to processes that may lack this package.
 
 from __future__ import annotations
 
-import asyncio
 import importlib
 import inspect
 import logging
@@ -592,6 +591,8 @@ def report_to_autoscaling() -> None:
     async def report() -> None:
         await manager._add_autoscaling_metrics_point_async()
         manager._push_autoscaling_metrics()
+
+    import asyncio
 
     asyncio.run_coroutine_threadsafe(report(), replica._event_loop)
 

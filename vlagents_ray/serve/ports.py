@@ -9,7 +9,6 @@ import time
 from collections import deque
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.protocol.messages import peer_uid
 
 LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"  # noqa: S104 - only compared, and bound for a moment
 # Environment variable of a replica: the address at which its server listens, if it differs from
@@ -69,6 +68,8 @@ def _claim(port: int) -> bool:
 
 
 def _is_claim_of_this_user(name: str) -> bool:
+    from vlagents_ray.protocol.messages import peer_uid
+
     for _ in range(2):
         with socket.socket(socket.AF_UNIX) as probe:
             probe.setblocking(False)

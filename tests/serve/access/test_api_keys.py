@@ -48,6 +48,7 @@ from vlagents_ray.serve.access.key_store import (
     read_keys,
     revoke,
 )
+from vlagents_ray.serve.access.variables import FILE_VARIABLE
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender, message_admission
 from vlagents_ray.serve.requests import IncomingMessage
@@ -408,7 +409,7 @@ def test_keys_come_from_a_file_or_the_environment(file: Path) -> None:
     token = new_key(file, "arm")
     for keys in (
         load_keys(str(file), {}),
-        load_keys(None, {api_keys.FILE_VARIABLE: str(file)}),
+        load_keys(None, {FILE_VARIABLE: str(file)}),
         load_keys(None, {api_keys.TEXT_VARIABLE: file.read_text()}),
     ):
         keys.check(token, "noop")

@@ -207,6 +207,20 @@ def _require_distinct(cases: list[EvalCase]) -> None:
         )
 
 
+def most_cpus(cases: Iterable[EvalCase]) -> float:
+    """Return the largest number of CPUs that a worker of any case requests; it may be a
+    fraction.
+    """
+    return max(case.worker.cpus for case in cases)
+
+
+def most_gpus(cases: Iterable[EvalCase]) -> float:
+    """Return the largest number of GPUs that a worker of any case requests; it may be a
+    fraction.
+    """
+    return max(case.worker.gpus for case in cases)
+
+
 def require_envs(cases: Iterable[EvalCase]) -> None:
     """Raise `UnknownEnv` for an unknown task, `ConfigError` for options that its env rejects."""
     for case in cases:

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import os
 import socket
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from math import ceil
 from pathlib import Path
@@ -23,7 +23,7 @@ from vlagents_ray.client.transports.serve_handle import ReplicaNodes
 from vlagents_ray.envs.graphics import GPUS, SHARE
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.records import WorkerInfo
-from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.cases import EvalCase, most_cpus
 from vlagents_ray.evaluate.plan.config import WorkerConfig
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan
 from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
@@ -50,20 +50,6 @@ def ray_cluster(plan: ResolvedPlan) -> Iterator[None]:
             with withheld():
                 stack.enter_context(joined("local", num_cpus=cpus))
         yield
-
-
-def most_cpus(cases: Iterable[EvalCase]) -> float:
-    """Return the largest number of CPUs that a worker of any case requests; it may be a
-    fraction.
-    """
-    return max(case.worker.cpus for case in cases)
-
-
-def most_gpus(cases: Iterable[EvalCase]) -> float:
-    """Return the largest number of GPUs that a worker of any case requests; it may be a
-    fraction.
-    """
-    return max(case.worker.gpus for case in cases)
 
 
 def runtime_env(case: EvalCase) -> dict[str, Any]:

@@ -30,11 +30,11 @@ from vlagents_ray.errors import ConfigError, Forbidden, TooManyRequests, Unautho
 from vlagents_ray.protocol.messages import PriorityName, is_loopback
 from vlagents_ray.serve.access.audit import Audit
 from vlagents_ray.serve.access.key_store import Key, parse_keys, read_text
+from vlagents_ray.serve.access.variables import FILE_VARIABLE, TEXT_VARIABLE
 from vlagents_ray.serve.token_bucket import TokenBucket
 
 logger = logging.getLogger(__name__)
 
-FILE_VARIABLE, TEXT_VARIABLE = "VLAGENTS_RAY_KEYS_FILE", "VLAGENTS_RAY_KEYS"
 _KEY_PROTOCOL = "vlagents.key."  # prefix of the WebSocket subprotocol that contains a key
 # Minimum and maximum time for which connections of a key over its rate are not read, s.
 _THROTTLED_S = (0.05, 1.0)

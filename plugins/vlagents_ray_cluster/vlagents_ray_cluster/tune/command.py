@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-import yaml
 
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import (
@@ -177,6 +176,8 @@ def tune_command(
         out.print(f"after {time.monotonic() - began:.0f} s")
         better_settings = chosen_settings(chosen, args.batch, tuner.fixed)
         if better_settings:
+            import yaml
+
             text = yaml.safe_dump(better_settings, sort_keys=False, default_flow_style=None)
             out.print(f"set below args of {application.name!r} in {deployment_file}:\n\n{text}")
         else:
