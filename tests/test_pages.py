@@ -46,7 +46,7 @@ SEEDS = {"first": 0, "a": 0, "b": 10, "machine-a": 20, "machine-b": 30} | {
 # Most commands in sentences cannot be run as they stand ("vlagents-ray serve POLICY"). Of the
 # remaining ones, these are run,
 RUN = {"vlagents-ray policies", "vlagents-ray robot --help"}
-# and these are not.
+# And these are not.
 NOT_RUN = {
     "vlagents-ray doctor": (
         "tests/cli/test_doctor.py runs each check, which starts a Ray and each simulator"

@@ -60,7 +60,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 
     monkeypatch.syspath_prepend(tmp_path)
     for module in [name for name in sys.modules if name.partition(".")[0] == "lab_policies"]:
-        # the module may come from the folder of another test
+        # The module may come from the folder of another test.
         monkeypatch.delitem(sys.modules, module)
     yield write
     registry._installed_entry_points.cache_clear()

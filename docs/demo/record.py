@@ -1,7 +1,7 @@
 """Record the session that index.html replays: `python docs/demo/record.py` runs the reference
 policy, and writes session.js.
 
-The policy is served, and called over a WebSocket, like by a robot. Each call returns a chunk of
+The policy is served, and called over a WebSocket, as by a robot. Each call returns a chunk of
 eight rows, of which four are executed. The states are those of the simulator, in its base frame
 (`vlagents_ray.envs.tabletop`).
 """

@@ -31,7 +31,7 @@ from vlagents_ray.serve.launch.server import running_server
 ROOT = Path(__file__).parents[2]
 FILE = Path(__file__).with_name("demo.gif")
 WIDTH, HEIGHT, CAPTION = 960, 540, 44  # px; CAPTION is the height of the line above the picture
-LIVE = 560  # px; width of the live page, beside which the scene takes the remaining width
+LIVE = 560  # width of the live page in px; the scene takes the remaining width
 PAGE_WIDTH = 840  # CSS px; at this width the live page shows two cards side by side
 FRAME_MS = 110
 FRAMES = 68

@@ -11,7 +11,7 @@ the output of a command, with its colours, as an SVG.
         "vlagents-ray robot check mujoco:so101_new_calib.xml --robot-set like=so101" \\
         docs/pictures/check.svg
 
-The background is dark in both colour schemes, like in many terminals.
+The background is dark in both colour schemes, as in many terminals.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from rich.console import Console
 from rich.segment import Segment
 from rich.text import Text
 
-# number of columns; width of a character, height of a line and margin in px, at a font size of 14
-# px
+# Number of columns; width of a character, height of a line and margin in px, at a font size of 14
+# px.
 COLUMNS, CHARACTER, LINE, MARGIN = 88, 8.43, 20, 16
 PAPER, INK, PROMPT = "#12161b", "#e8ebef", "#5fd3a3"
 COLOURS = {

@@ -55,7 +55,7 @@ PidFile none
 StrictModes no
 UsePAM no
 """
-# a user of Debian and Ubuntu; `sshd` runs as this user, and accepts only this one
+# A user of Debian and Ubuntu; `sshd` runs as this user, and accepts only this one.
 USER = "www-data"
 DRIVE = """
 import json, sys
@@ -103,7 +103,7 @@ def test_the_link_delays_loses_and_cuts_packets_and_heals(far: Far) -> None:
         delayed = round_trips_s(50)
         assert len(delayed) == 50
         assert delayed[0] >= 0.08
-        # in each direction, so about half of the round trips succeed
+        # In each direction, so about half of the round trips succeed.
         far.link.set(Conditions(loss=0.3))
         assert 5 < len(round_trips_s(50)) < 45
         far.link.set(Conditions(cut=True))

@@ -132,7 +132,7 @@ def test_the_interval_covers_the_truth_about_as_often_as_it_says() -> None:
 
 
 def test_what_slows_both_down_does_not_widen_the_ratio() -> None:
-    # the machine becomes three times slower, in the same way for both
+    # The machine becomes three times slower, in the same way for both.
     load = np.linspace(1, 3, 20)[:, None]
     a, b = trips("a", 1.0), trips("b", 2.0, seed=1)
     found = median_ratio(RoundTrips("a", a.rounds * load), RoundTrips("b", b.rounds * load))

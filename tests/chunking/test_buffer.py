@@ -121,7 +121,7 @@ def test_a_policy_that_chunks_in_real_time_is_told_of_no_more_rows_than_are_left
     plan = ChunkBuffer()
     assert plan.continuation(3) == {}
     plan.add(chunk(0, 0, [0, 1, 2]))
-    # after a stall, all remaining rows will be executed
+    # After a stall, all remaining rows will be executed.
     for delay, told in ((0, 0), (2, 2), (150, 3)):
         assert plan.continuation(delay)["delay_ticks"] == told
 

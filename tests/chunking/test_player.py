@@ -122,7 +122,7 @@ def test_a_chunk_is_executed_as_far_as_the_mode_says(
 
 def test_async_executes_the_old_chunk_while_the_next_is_made(playing: Playing) -> None:
     agent, player = playing(Counting(gated=True), mode="async")
-    # the request was sent at tick 1, and has no answer yet
+    # The request was sent at tick 1, and has no answer yet.
     assert play(player, range(3)) == [0, 0.1, 0.2]
     let(agent, player)
     # Rows 2 and 3 of the answer to tick 1, whose first two rows are late.
@@ -284,7 +284,7 @@ def test_a_plan_grows_old_from_when_its_observation_was_captured(playing: Playin
         now = time.monotonic()
         patch.setattr("vlagents_ray.chunking.player.time.monotonic", lambda: now + 1.0)
         patch.setattr("vlagents_ray.chunking.buffer.time.monotonic", lambda: now + 1.0)
-        # a new request was sent although five rows were left
+        # A new request was sent although five rows were left.
         assert play(player, range(8, 9)) == [8]
 
 
@@ -337,7 +337,7 @@ def test_after_an_interrupt_the_measured_pose_counts_and_not_what_was_commanded_
     let(agent, player)
     player.interrupt()
     pose.at = 3.1  # moved by hand
-    # the robot holds this position
+    # The robot holds this position.
     assert player.act(obs(3)).action.tolist() == pytest.approx([3.1, 3.1])
     let(agent, player)
     assert play(player, range(4, 6)) == [3, 3.1]
@@ -353,7 +353,7 @@ def test_after_an_interrupt_nothing_leads_back_to_what_was_commanded_before_it(
     assert play(player, range(3)) == [0, 0.1, 0.2]
     player.interrupt()
     pose.at = 0.9
-    # the home position is rejected
+    # The home position is rejected.
     assert player.act(obs(3)).action.tolist() == pytest.approx([0.9, 0.9])
     player.interrupt()
     pose.at = 5.0  # beyond the limits, so that no action is accepted

@@ -99,7 +99,9 @@ class Driver:
         wait_for(lambda: not caller.busy, every_s=0.0005)
 
     def request(self, number: int) -> dict[str, Any]:
-        """Return the info of a request as soon as it has been sent. Request 0 is the reset's."""
+        """Return the info of a request as soon as it has been sent. Request 0 is the request of the
+        reset.
+        """
         wait_for(lambda: len(self.agent.infos) > number, every_s=0.0005)
         return self.agent.infos[number]
 

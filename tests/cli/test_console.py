@@ -215,7 +215,7 @@ def test_all_commands_are_on_one_screen() -> None:
     said = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80", "TERMINAL_WIDTH": "80"}).output
     names = re.findall(r"^  ([a-z][\w-]*)  ", said, re.MULTILINE)
     assert names[:5] == ["serve", "eval", "robot", "demo", "doctor"]
-    # the help text of each command fits on one line
+    # The help text of each command fits on one line.
     assert len(said.splitlines()) <= len(names) + 18
 
 

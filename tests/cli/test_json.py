@@ -35,7 +35,7 @@ def offering(command: Any, name: str = "") -> Iterator[str]:
 
 def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "checks", lambda *_: [("Ray", Check("fail", "none", "install it"))])
-    # other environments would load simulators
+    # Other environments would load simulators.
     monkeypatch.setattr(listing, "env_class", lambda _: Tabletop)
     policies = [
         {"name": name, "url": f"http://localhost:{port}"} for port, name in enumerate(("a", "b"), 1)
@@ -70,7 +70,7 @@ def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyP
         {"check": "Ray", "status": "fail", "detail": "none", "cure": "install it"}
     ]
     (pair,) = said["report"]["comparisons"]
-    # the same order as on the page
+    # The same order as on the page.
     assert (pair["a"], pair["b"], pair["lines"][-1]["suite"]) == ("b", "a", "all")
     assert sum(case["episodes"] for case in said["report"]["cases"]) == 4
     assert not (out / "report.html").exists()

@@ -1,4 +1,4 @@
-"""`vlagents-ray keys`: its output, and the resulting file."""
+"""`vlagents-ray keys`: the output of its commands, and the file of keys that they write."""
 
 from __future__ import annotations
 

@@ -188,7 +188,7 @@ def response(body: bytes, media_type: str, status: str = "200 OK") -> bytes:
 
 @contextlib.contextmanager
 def http_policy(metadata: Any, act: bytes, status: str = "200 OK") -> Iterator[str]:
-    """Serve metadata, resets, and one answer to each act; yield the URL."""
+    """Serve metadata, answer resets, and answer one act with `act` and `status`; yield the URL."""
     document = metadata if isinstance(metadata, bytes) else json.dumps(metadata).encode()
     answers = {
         "/v1/metadata": response(document, "application/json"),

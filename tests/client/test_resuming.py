@@ -199,7 +199,7 @@ def test_a_session_of_a_dead_replica_begins_again_and_sees_its_history(
     frame = obs(1)
     agent.reset(frame, "stack", seed=3)
     for value in (2, 3, 4):
-        # like an environment that always renders into the same memory
+        # Like an environment that always renders into the same memory.
         frame.cameras["front"][:] = value
         agent.act(frame)
     served.dead.add(0)
@@ -598,7 +598,7 @@ def test_a_replica_that_is_only_slow_keeps_the_session_or_gives_it_on(
         return call(self, requests, 0.1)  # less than the 30 s in which the replica may act
 
     monkeypatch.setattr(InProcess, "call", too_late)
-    # the client connects to the same replica again, or to another one
+    # The client connects to the same replica again, or to another one.
     for number, prefer in ((1, 0), (2, 1)):
         served = replicas(number)
         agent = served.agent()

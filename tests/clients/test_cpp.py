@@ -539,7 +539,7 @@ def test_keys(programs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             client.reset()
             assert client.act(info={"value": 2})["values"][0] == 2
             server.known.change("arm", revoked=True)
-            # the server has noticed the end of its connection
+            # The server has noticed the end of its connection.
             wait_for(lambda: not server.engine.sessions)
             assert refused(client).code == "unauthorized"
 

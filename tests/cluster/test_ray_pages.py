@@ -186,7 +186,7 @@ def test_no_other_user_reaches_the_socket_that_commands_haproxy(tmp_path: Path) 
     own = ingress_environment(tmp_path, "/bin/true")
     wanted = {name for name, value in own.items() if value.startswith(str(tmp_path))}
     (tmp_path / "no-replica.http").unlink()
-    files = haproxy_files(tmp_path, times=2)  # like on the page
+    files = haproxy_files(tmp_path, times=2)  # as on the page
     assert set(files) == wanted
     # HAProxy's binary is called, not the launcher itself
     assert str(haproxy_binary()) in files[HAPROXY].read_text()

@@ -53,7 +53,7 @@ def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> No
             }
             if rows[OWN, 4]["of_linear"] > 0.6:
                 break
-        # These episodes are over before the last worker is ready, like in rounds that measure the
+        # These episodes are over before the last worker is ready, as in rounds that measure the
         # driver's costs.
         short = PlayedEpisodes(
             **driver.request(
@@ -62,7 +62,7 @@ def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> No
             )
         )
     assert (short.episodes, short.episodes_per_minute) == (7, None), (
-        "episodes after the first worker's start"
+        "expected episodes, but no rate, since they end before the last worker is ready"
     )
     own = rows[OWN, 4]
     assert own["of_linear"] > 0.6

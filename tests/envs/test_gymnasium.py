@@ -70,7 +70,7 @@ class Arm(gymnasium.Env[dict[str, Any], np.ndarray]):
         )
 
     def observation(self) -> dict[str, Any]:
-        self.image[:] = self.count  # one buffer for all observations, like in some simulators
+        self.image[:] = self.count  # one buffer for all observations, as in some simulators
         return {"images": {"top": self.image}, "robot": {"qpos": self.qpos}}
 
     def render(self) -> Any:

@@ -22,7 +22,7 @@ SEEDS = [4, 9]
 
 @pytest.mark.parametrize("task", ["PushCube-v1", "PickCube-v1"])
 def test_success_and_return_are_those_of_maniskills_own_wrapper(task: str) -> None:
-    """ManiSkill's environment is created like in its guide for CPU simulation, and gets the same
+    """ManiSkill's environment is created as in its guide for CPU simulation, and gets the same
     actions as this package's environment.
     """
     with ManiSkill(task, **SMALL) as env:

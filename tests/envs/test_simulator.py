@@ -19,7 +19,7 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import entries
 from vlagents_ray.testing import require_wireable
 
-# this project's example, and third-party environments by their ids
+# This project's example, and third-party environments by their ids.
 ANY_PROTOCOL = {"tabletop", "gymnasium"}
 
 PROTOCOL = BenchmarkProtocol(

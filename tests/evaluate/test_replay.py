@@ -91,7 +91,7 @@ def test_without_a_trajectory_it_is_said_that_the_actions_differ(
 
 
 class Rounded(ToZero):
-    """A policy that differs from the recorded one in its third action, like in a batch of another
+    """A policy that differs from the recorded one in its third action, as in a batch of another
     size.
     """
 

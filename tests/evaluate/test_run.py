@@ -100,7 +100,7 @@ class TestOnACluster:
     def test_a_signal_keeps_what_is_finished_and_leaves_no_worker(
         self, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        # names of processes when Ray is disconnected, which takes long if Ray is also being stopped
+        # Names of processes when Ray is disconnected, which takes long if Ray is also being stopped
         found: list[str] = []
 
         @contextlib.contextmanager

@@ -77,7 +77,7 @@ def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
 
     with start(settings, ray_folder) as evaluation:
         wait_for(lambda: all((tmp_path / f"gate-{seed}").exists() for seed in (5, 6)))
-        # both workers are in the middle of an episode
+        # Both workers are in the middle of an episode.
         wait_for(lambda: len(episodes(settings)) == 5)
         # A process that is starting has its parent's environment for a moment.
         wait_for(lambda: leaked(KEY, [ray_folder]) == [f"/proc/{evaluation.pid}/environ"])

@@ -171,7 +171,7 @@ def episodes() -> Iterator[Trace]:
         replicas=2,
     )
     held = [begin, asks(reset(), who="b"), Send("a", asked("wait")), server("is acting")]
-    # the deadline has passed before any server reads the request
+    # The deadline has passed before any server reads the request.
     held.append(Send("b", act(deadline_ms=0.001)))
     name, later = "a deadline that is over", asks(act(deadline_ms=1e6), who="b")
     yield from scenario(name, TOGETHER[2:4], *held, gets("b"), server("acts on"), gets("a"), later)

@@ -416,7 +416,7 @@ WHO = [
     (r"gcs_server|raylet", "tcp", "local", "token"),
     (r"raylet", "unix", r".*/sockets/(raylet|plasma_store)", "user"),
     (r"ray::DashboardAgent|ray::RuntimeEnvAgent|agent\.py", "tcp", "local", "token"),
-    # the port of Ray's worker is also here; it requires the token
+    # The port of Ray's worker is also here; it requires the token.
     (REPLICA, "tcp", "local", "key"),
     (REPLICA, "tcp", "any", "token"),  # for calls between deployments, tested below
     (REPLICA, "unix", r"@vlagents-ray-[0-9a-f]{32}", "key"),

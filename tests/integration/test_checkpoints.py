@@ -214,7 +214,7 @@ def test_a_redeploy_of_what_does_not_load_leaves_the_old_one_and_says_why(
 def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(
     fresh: Server, folder: Path
 ) -> None:
-    # any setting of the policy can be swapped
+    # Any setting of the policy can be swapped.
     redeploy(folder, replicas=2, checkpoint_step=4, scale=10.0)
 
     def numbers() -> dict[int, set[float]]:

@@ -21,7 +21,7 @@ from ray_processes import free_address, healthy
 from vlagents_ray import ConfigError
 from vlagents_ray.evaluate import Results
 
-# a variable in the environment of all processes that the command starts
+# A variable in the environment of all processes that the command starts.
 MINE = "VLAGENTS_RAY_TEST_COMMAND"
 
 

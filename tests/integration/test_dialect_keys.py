@@ -43,7 +43,7 @@ def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(
             drive(peers_python(), "openpi_keyed", f"{url}#{shown}", 1, 1)
             for shown in (key, "wrong", "")
         ]
-        # the length of "abc", and the first acts
+        # The length of "abc", and the first acts.
         assert [row[3:] for row in answers[0][0]] == [[3, 1], [3, 2]]
         assert answers[1:] == [[401], [401]]
         with Client(robots) as robot:

@@ -46,7 +46,7 @@ class Family:
     kind: tuple[str, ...] = ()
     within: str = ""  # path of the checkpoint in the folder that tiny.py wrote
     config: dict[str, Any] = field(default_factory=dict)
-    # in the values, {} stands for the folder that tiny.py wrote
+    # In the values, {} stands for the folder that tiny.py wrote.
     env_vars: dict[str, str] = field(default_factory=dict)
     source: str | None = None  # the variable with the checkout of its source
     atol: float = 1e-4

@@ -45,7 +45,7 @@ def evaluating(ray_home: Path, log: Path, *words: str) -> Iterator[LivePage]:
 
 
 def test_it_shows_cases_sessions_and_failures_while_it_runs(ray_home: Path, tmp_path: Path) -> None:
-    # the last episode waits until the test opens the gate
+    # The last episode waits until the test opens the gate.
     settings = [f"folder={tmp_path}", "trouble={gate: [3]}"]
     words = [word for setting in settings for word in ("--env-set", setting)]
     policy = [

@@ -116,7 +116,7 @@ def test_any_http_client_keeps_its_session_when_its_replica_stops(server: Server
     def replicas() -> int:
         return len({post("reset", name, {"instruction": name})["info"]["pid"] for name in names})
 
-    # the load balancer is updated some time after a new replica has started
+    # The load balancer is updated some time after a new replica has started.
     wait_for(lambda: replicas() > 1)
     for value in range(3):
         for name in names:

@@ -332,8 +332,8 @@ def test_a_killed_replica_is_noticed_and_the_next_one_serves() -> None:
     pid = agent.reset(frame(), "before")["pid"]
     folder = Path(global_worker.node.plasma_store_socket_name).parent
     names, channel = set(folder.glob("vla*")), agent._connection.transport._channel.hex()
-    # without garbage collection, a leftover traceback of the loss would keep its objects; the
-    # channel must not be among them
+    # Without garbage collection, a leftover traceback of the loss would keep its objects; the
+    # channel must not be among them.
     gc.disable()
     os.kill(pid, signal.SIGKILL)
     begun = time.monotonic()

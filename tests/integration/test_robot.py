@@ -26,7 +26,7 @@ from vlagents_ray.robot.pacing import Pacer, jitter, undisturbed
 HZ = 50.0
 ROWS = 50
 PATIENCE_S = 300.0
-# number of attempts at a measurement that a pause of the machine for a second can spoil
+# Number of attempts at a measurement that a pause of the machine for a second can spoil.
 ATTEMPTS = 5
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
@@ -75,7 +75,7 @@ class Witness(Agent):
         executed = self.executed[self.robot.tick] = sum("safe" not in one.info for one in self.acts)
         self.acts.append(act)
         if "safe" in act.info:
-            # the robot holds its position
+            # The robot holds its position.
             assert act.action.tolist() == self.acts[-2].action.tolist()
         else:
             asked, row = act.action.tolist()
@@ -138,7 +138,7 @@ def test_no_tick_is_without_an_action_though_an_answer_takes_ten_ticks(
         if report.safe_ticks == 0 and report.jitter["on_time"] > 0.9 * machine["on_time"]:
             break
     else:
-        pytest.fail(f"{report}, an empty loop {machine}")
+        pytest.fail(f"{report}; jitter of an empty loop: {machine}")
     assert len({act.info["chunk"] for act in seen.acts}) > 5
 
 

@@ -20,7 +20,7 @@ TRANSPORTS: list[TransportName] = ["shm", "plasma", "websocket", "http", "handle
 
 @pytest.fixture(scope="module")
 def server(shared_ray: None) -> Iterator[Server]:
-    """Serve one replica of a policy that is written like in the paper."""
+    """Serve one replica of a policy that is written as in the paper."""
     with serving("served_agents:Reacher", config={"scale": 2.0}, batch={"max_size": 8}) as server:
         yield server
 

@@ -27,7 +27,7 @@ from vlagents_ray.serve.launch.server import Server
 APP = "Located"
 SESSIONS = 12
 EVERY_S = 0.25
-SPREAD_S = 40.0  # comparisons are 3 s apart, and a move needs two in a row
+SPREAD_S = 40.0  # comparisons are 3 s apart, and sessions move only after two agreeing comparisons
 
 
 def deployed(replicas: int) -> Deployment:

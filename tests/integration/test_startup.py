@@ -102,7 +102,7 @@ def test_the_port_is_closed_while_the_policy_loads_and_clients_wait_for_it(tmp_p
         thread.join(120)
         first, info = answers
         assert first == "refused"
-        # the digest of the file that a setting names
+        # The digest of the file that a setting names.
         assert info["weights"].startswith("sampled-sha256:")
         assert health(url) == 200
 

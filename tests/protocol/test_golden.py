@@ -59,7 +59,7 @@ def require_valid(document: Any, name: str) -> None:
 
 
 def plain(means: Any) -> Any:
-    """Return a meaning whose image files are replaced by pixels, like in decoded requests."""
+    """Return a meaning whose image files are replaced by pixels, as in decoded requests."""
     if isinstance(means, dict) and means.get("$") == "image":
         pixels = means.get("pixels")
         return (

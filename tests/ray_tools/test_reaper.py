@@ -43,7 +43,7 @@ with reaped(Path(folder), lost=ConnectionError):
 
 
 def test_the_reaper_needs_no_package_that_only_its_driver_finds(tmp_path: Path) -> None:
-    # -S hides site-packages, even where the package is installed, like in an environment that finds
+    # -S hides site-packages, even where the package is installed, as in an environment that finds
     # it through PYTHONPATH
     command = [sys.executable, "-I", "-S", reaper.__file__, str(tmp_path / "cluster")]
     ran = subprocess.run(command, check=False, input="", capture_output=True, text=True, timeout=60)

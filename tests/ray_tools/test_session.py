@@ -78,7 +78,7 @@ def test_a_cluster_that_was_lost_is_not_taken_for_the_one_that_this_process_join
         ("http://127.0.0.1:8000", None, "http://127.0.0.1:8000"),
         ("http://127.0.0.1:8000", "198.18.0.9:6379", "http://127.0.0.1:8000"),
         ("auto", None, None),
-        # for a cluster of `ray start`, which prints the address
+        # For a cluster of `ray start`, which prints the address.
         ("auto", "198.18.0.9:6379", "Ray's"),
     ],
 )

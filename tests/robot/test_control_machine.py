@@ -153,7 +153,7 @@ class Machine(RuleBasedStateMachine):
             self.watchdog.share(self.agent.control)
         self.control = self.watchdog.control
 
-    # the robot
+    # The robot.
     def observe(self) -> Obs:
         if self.failing:
             self.failing = False

@@ -177,7 +177,7 @@ def test_the_first_action_is_eased_in_from_the_measured_pose_and_the_plan_follow
     for order, limit in ((1, 4.0), (2, 80.0), (3, 16000.0)):
         assert np.abs(np.diff(path[: len(path) - 1], order)).max() * 200**order <= limit * 1.01
     assert np.isclose(path[-1], rows[-1])
-    # each row is executed, and none is skipped
+    # Each row is executed, and none is skipped.
     assert np.isclose(path[-30:], rows[-30:], atol=1e-6).all()
 
 

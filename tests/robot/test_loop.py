@@ -166,7 +166,7 @@ def test_the_process_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch, *, froze
         assert (after[0], *after[2:]) == (before[0], *before[2:])
         assert (gc.get_freeze_count() >= before[1]) if frozen else (gc.get_freeze_count() == 0)
     finally:
-        gc.freeze()  # like in conftest.py
+        gc.freeze()  # as in conftest.py
 
 
 @pytest.mark.parametrize("real_time", [False, True])
@@ -175,7 +175,7 @@ def test_where_threads_have_no_priorities_the_loop_does_without(
 ) -> None:
     monkeypatch.setattr(sys, "platform", "darwin")
     monkeypatch.delattr(os, "sched_getscheduler")
-    # there is no such process
+    # There is no such process.
     monkeypatch.setattr(os, "getpriority", lambda *_: os.kill(2**22 + 1, 0))
     with undisturbed(real_time=real_time) as done:
         assert "no priority (only on Linux)" in done

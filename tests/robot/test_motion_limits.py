@@ -220,7 +220,7 @@ def test_the_distance_of_the_first_action_is_limited_by_first_alone_if_it_is_giv
 # Each key of a limits file has an effect, or is an error.
 
 EFFECTS: dict[str, tuple[dict[str, object], list[list[float]]]] = {
-    # the smallest file with this key, and a sequence of actions that it rejects
+    # The smallest file with this key, and a sequence of actions that it rejects.
     "low": ({"low": 0.0}, [[-0.1]]),
     "high": ({"high": [1.0]}, [[1.1]]),
     "velocity": ({"velocity": 1.0}, [[0], [0.03]]),

@@ -138,7 +138,7 @@ def test_ctrl_c_in_a_call_is_no_error_of_the_policy(monkeypatch: pytest.MonkeyPa
 def test_the_metadata_say_how_chunks_continue_plans(agent: Agent, stated: tuple[bool, int]) -> None:
     replicas = Replicas([agent])
     try:
-        # after the policy has loaded
+        # After the policy has loaded.
         replicas.agent().reset(Obs(state={"position": np.zeros(1)}), None)
         metadata = policy_metadata(ServerArgs(policy=THIS), replicas.engines[0], None, {})
         assert (metadata["continues_plans"], metadata["longest_prefix"]) == stated

@@ -578,7 +578,7 @@ def test_a_frame_that_waits_for_another_to_be_decoded_spends_its_own_deadline(
     client = _connected(endpoints[0])
     client.send(frame(reset()), 10)
     assert decode_replies(client.recv(10))[0].error is None
-    # both messages are read at once
+    # Both messages are read at once.
     client._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_CORK, 1)
     client.send(act(LARGE, "large"), 10)
     client.send(act(JPEG, "small", deadline_ms=200), 10)

@@ -137,7 +137,7 @@ def test_haproxy_alone_faces_the_network(tmp_path: Path, monkeypatch: pytest.Mon
     assert "bind 192.0.2.7:8000\n" in front.settings()
     assert f"server inside {LOOPBACK}:8001\n" in front.settings()
     front.require()
-    # a setting that a user may have
+    # A setting that a user may have.
     monkeypatch.setenv("RAY_SERVE_HAPROXY_BALANCE_ALGORITHM", "leastconn")
     with pytest.raises(ConfigError, match="to this function"):
         front.require()

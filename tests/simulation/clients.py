@@ -92,7 +92,7 @@ class Robot:
             elif outcome in _UNCERTAIN:
                 self.uncertain.add(name)
                 if self.steps or self.gives_up:
-                    # the state of the session is unknown, so the robot begins another episode
+                    # The state of the session is unknown, so the robot begins another episode.
                     return
             else:
                 if not self.world.plan.rough and not self._excuses():
@@ -103,8 +103,8 @@ class Robot:
                 return
 
     def _excuses(self) -> set[str]:
-        """Return the requests that may arrive late and end the episode. Over connections that the
-        robot has closed, only resets may.
+        """Return the requests that may arrive late and end the episode. Over closed connections,
+        only a reset can do this.
         """
         return {name for name in self.uncertain if self.link is None or "/" in name}
 

@@ -83,7 +83,7 @@ class Loop(asyncio.AbstractEventLoop):
         return task
 
     def close(self) -> None:
-        """Drop all pending events, like at the end of a process; the effects of `finally` blocks
+        """Drop all pending events, as at the end of a process; the effects of `finally` blocks
         are invisible to others.
         """
         self.ended = True

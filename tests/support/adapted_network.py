@@ -79,12 +79,12 @@ def base(tmp_path: Path) -> Path:
 
 
 def pairs(network: Any, layers: Sequence[str], rank: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Return random LoRA matrices A and B for these layers of a torch module, named like in PEFT.
+    """Return random LoRA matrices A and B for these layers of a torch module, named as in PEFT.
     They change results about as much as the layers themselves.
     """
     rng, modules, found = np.random.default_rng(seed), dict(network.named_modules()), {}
     for layer in layers:
-        # a convolution also has the dimensions of its kernel
+        # A convolution also has the dimensions of its kernel.
         outputs, *inputs = modules[layer].weight.shape
         ups = (outputs, rank, *(1 for _ in inputs[1:]))
         for name, shape, fan in (("A", (rank, *inputs), np.prod(inputs)), ("B", ups, rank)):

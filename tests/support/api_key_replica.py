@@ -192,7 +192,7 @@ class KeyedReplica:
         )
         metadata = METADATA | {"policy_version": None, "weights": None}
         context = PartContext(self.engine, "this", "here", lambda: metadata)
-        # its routes for weights are replaced by routes with another receiver
+        # Without the part of weights, whose routes are added below with another receiver.
         parts = open_parts(PartArgs(weights=None), context)
         stack.callback(parts.close)
         others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *parts.routes()]

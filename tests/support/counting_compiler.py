@@ -21,7 +21,7 @@ class CountingCompiler:
         self.rows: list[int] = []  # number of rows of each program
         # Changes to the results of programs, by number of rows.
         self.change: dict[int, Callable[[Any], Any]] = {}
-        self.calls = 0  # calls of programs
+        self.calls = 0  # number of calls of programs
 
     def __call__(self, graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
         rows = next(

@@ -136,7 +136,7 @@ class CppClient:
         error: BaseException | None,
         at: TracebackType | None,
     ) -> None:
-        # the driver ends when its input ends
+        # The driver ends when its input ends.
         _, said = self._process.communicate(timeout=_ANSWER_S)
         if kind is None:
             assert (self._process.returncode, said) == (0, "")

@@ -61,7 +61,7 @@ SITUATIONS = (
     "stop of the server",
 )
 
-# Kinds of messages. Only a control frame is free.
+# Kinds of messages. Only a control frame costs nothing.
 MESSAGES = (
     "reset",
     "act",
@@ -274,7 +274,7 @@ OTHER_SHAPES = (
     seen(state={"joints": np.zeros(3, np.float32)}),
 )
 UNKNOWN_SESSIONS = (act(), act(session="another"))
-# Several requests of one message. Closing a session is free next to other requests.
+# Several requests of one message. Closing a session costs nothing next to other requests.
 SEVERAL = [
     *(reset(session=session) for session in ("x", "y", "z")),
     Request("close", session="x"),
@@ -289,7 +289,7 @@ def _episode_steps(
     wrong: Sequence[Request] = OTHER_SHAPES,
     unknown: Sequence[Request] = UNKNOWN_SESSIONS,
 ) -> dict[str, list[Steps]]:
-    """The situations that every endpoint of our own protocol has.
+    """Return the situations that every endpoint of this project's own protocol has.
 
     `polled` is whether only the policy's thread answers late requests, as soon as it is free again.
     """
@@ -304,7 +304,7 @@ def _episode_steps(
         asked_by("b", reset()),
         Send("a", say("a", asked("wait"))),
         server("is acting"),
-        # the deadline has passed before any server reads the request
+        # The deadline has passed before any server reads the request.
         Send("b", say("b", act(deadline_ms=0.001))),
     ]
     if polled:

@@ -470,7 +470,7 @@ class GpuTensor(torch.Tensor):
         args, kwargs = tree_map(_values, (args, kwargs or {}))
         inputs = [one.values for one in own]
         result = cuda.run(index, lambda: op(*args, **kwargs), inputs)
-        # an in-place operation returns one of its arguments
+        # An in-place operation returns one of its arguments.
         wrappers = {id(one.values): one for one in own}
 
         on_host = {

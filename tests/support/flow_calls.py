@@ -18,7 +18,7 @@ class FlowCalls:
     """The number of calls of an act, or of its kernel launches."""
 
     prefix: int
-    once: int  # what is the same in all steps, or follows from their times
+    once: int  # calls that are made once for all steps, or that depend only on the steps' times
     step: int
 
     @property

@@ -25,7 +25,7 @@ def encode(value: Any) -> Any:
 
 
 def encode_packed(value: Any) -> Any:
-    """Encode an array like msgpack_numpy, which GR00T's newest client uses."""
+    """Encode an array as msgpack_numpy does, which GR00T's newest client uses."""
     if isinstance(value, np.ndarray):
         return {
             b"nd": True,
@@ -45,8 +45,8 @@ def decode_n15(value: Any) -> Any:
 
 
 def modality_config(delta_indices: list[int], modality_keys: list[str]) -> dict[str, list[Any]]:
-    """Return the fields of a modality config. Like in the newest client, a modality without keys is
-    rejected.
+    """Return the fields of a modality config. As in the newest client, a modality without keys is
+    an error.
     """
     if not modality_keys:
         raise ValueError("modality_keys must not be empty")

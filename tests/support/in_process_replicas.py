@@ -54,9 +54,9 @@ class Replicas:
     ) -> None:
         self.dead: set[int] = set()
         self.frozen: set[int] = set()
-        # number of the replica for new connections, if it is alive and not stopping
+        # Number of the replica for new connections, if it is alive and not stopping.
         self.prefer = 0
-        # whether the reply to the next frame is lost after the policy has acted
+        # Whether the reply to the next frame is lost after the policy has acted.
         self.lose_reply = False
         self.stopping = False  # whether the server has no application, as at its start and stop
         self.frames: list[int] = []  # number of requests in each sent frame
@@ -193,8 +193,8 @@ class _Peer(Peer):
 
 
 def export(engine: Engine, session_id: str) -> SessionState | None:
-    """Take a session out of a replica, as another replica does that adopts it; return None if the
-    session must stay.
+    """Take a session out of a replica, as a replica does that adopts the session; return None if
+    the session must stay.
     """
     copied = answered(engine, session_id, Request("export"))
     if copied.info is None:

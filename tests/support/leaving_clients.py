@@ -85,13 +85,13 @@ BOUND_S = 5.0  # longest time for any wait
 LARGE = 240
 HELD = 250  # from this brightness on, the policy waits until its gate opens
 OTHERS = ("another", "a third")  # sessions of other clients
-# duration of each act, so that another thread reads the connections while the policy acts
+# Duration of each act, so that another thread reads the connections while the policy acts.
 SLOW_S = 0.02
 ACTED = "acted"
 LIMITS = MessageLimits(body_bytes=2**20)
 
 
-# random values, which no protocol can compress
+# Random values, which no protocol can compress.
 _LARGE_ACTION = np.random.default_rng(0).random(2**21, np.float32)
 
 
@@ -159,7 +159,7 @@ class SlowRelay:
 
 
 class StoppableServer:
-    """A replica that stops like in Serve, and gateways that stop at the same time."""
+    """A replica that stops as in Serve, and gateways that stop at the same time."""
 
     def __init__(self, stack: contextlib.ExitStack) -> None:
         self.stack = stack
@@ -179,7 +179,7 @@ class StoppableServer:
         self.near.open()
         self.engine.start()
         self.shutdown = Shutdown()
-        # the event loop of requests to the server's port
+        # The event loop of requests to the server's port.
         self._loop: asyncio.AbstractEventLoop | None = None
         self.requests = 0  # number of HTTP requests and WebSockets in progress
         routes = dialect_routes(
@@ -477,7 +477,7 @@ class HttpClient(LeavingClient):
         self._connection.endheaders(document[: len(document) // 2])
 
     def end(self) -> str:
-        # the answer to the half message, since an idle connection ends only with the process
+        # The answer to the half message, since an idle connection ends only with the process.
         return self.answer()
 
     def leave(self) -> None:

@@ -83,7 +83,7 @@ def _importable() -> Iterator[None]:
 
 
 def pickled(message: Any, protocol: int = pickle.DEFAULT_PROTOCOL) -> bytes:
-    """Pickle a message like LeRobot's client and server."""
+    """Pickle a message as LeRobot's client and server do."""
     with _importable():
         return pickle.dumps(message, protocol)
 
@@ -139,7 +139,7 @@ BEGIN, MIDDLE, END = 1, 2, 3
 
 
 def parts_of(data: bytes, size: int = 2 * 2**20) -> Iterator[bytes]:
-    """Return the messages of an observation, in parts like LeRobot's client sends them."""
+    """Return the messages of an observation, in the parts that LeRobot's client sends."""
     for at in range(0, len(data), size):
         state = END if at + size >= len(data) else BEGIN if at == 0 else MIDDLE
         yield field_of(1, state) + field_of(2, data[at : at + size])

@@ -19,7 +19,7 @@ from mirror_policy import CAMERA, SIDE, colour_of
 
 MOTORS = ("shoulder.pos", "elbow.pos", "gripper.pos")
 KEYBOARD = "MIRROR_KEYBOARD"  # file descriptor to which the operator's key presses are written
-# number of the policy's actions before a correction, and of the operator's actions in a correction
+# Number of the policy's actions before a correction, and of the operator's actions in a correction.
 WATCHED, MOVED = 5, 3
 
 

@@ -53,7 +53,7 @@ class MirrorPolicy(Agent):
     """
 
     contract = CONTRACT
-    # shared by all sessions, which are copies
+    # Shared by all sessions, which are copies.
     begun: ClassVar[list[tuple[str | None, object]]] = []
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:

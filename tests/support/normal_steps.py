@@ -24,7 +24,7 @@ def logprob_of_steps(velocity: Callable[[Any, float], Any], chain: np.ndarray, l
             velocity(before[None], float(t))[0],
             level * (t / (1 - (t if t < 1 else s))) ** 0.5,
         )
-        # the model's estimates of data and noise
+        # The model's estimates of data and noise.
         clean, noise = before - t * v, before + (1 - t) * v
         mean = (1 - s) * clean + (s - sigma**2 * (t - s) / (2 * t)) * noise
         total += torch.distributions.Normal(mean, sigma * (t - s) ** 0.5).log_prob(after)

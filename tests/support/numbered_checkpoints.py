@@ -39,7 +39,7 @@ class Numbered(Agent):
     def initialize(self) -> None:
         self.library.load(self)
         self.number = float(self.name.rpartition("/")[2])
-        # a reference cycle, like in real policies: only garbage collection frees the policy
+        # A reference cycle, as in real policies: only garbage collection frees the policy.
         self.itself = self
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -70,7 +70,7 @@ class Library:
         self.batches: list[tuple[str, list[str]]] = []
         self.joints: dict[str, int] = {}  # number of joints in a checkpoint's contract
         self.held: dict[str, threading.Event] = {}  # events for which loading waits
-        # names of the checkpoints whose loading has begun
+        # Names of the checkpoints whose loading has begun.
         self.begun: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     def make(self, settings: Mapping[str, Any]) -> Agent:

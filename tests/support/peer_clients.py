@@ -23,7 +23,7 @@ def observations(client: int, calls: int) -> list[dict[str, Any]]:
     changes once.
     """
     tasks = [f"task {client + 100 * (call >= calls // 2)}" for call in range(calls)]
-    # the value 255 makes the policy slow
+    # The value 255 makes the policy slow.
     pixels = [(client * 16 + call) % 255 for call in range(calls)]
     return [
         {"pixel": p, "number": float(client + 1), "task": t}
@@ -163,7 +163,7 @@ def openvla(url: str, client: int, calls: int) -> list[Any]:
 
 
 def openvla_patched(url: str, client: int, calls: int) -> list[Any]:
-    """The same client with json_numpy's patch of the json module, like in OpenVLA's own code."""
+    """The same client with json_numpy's patch of the json module, as in OpenVLA's own code."""
     import json_numpy
     import requests
 

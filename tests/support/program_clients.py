@@ -1,5 +1,5 @@
-"""Third-party programs, started like their users start them: `program_clients.py PROGRAM PORT`,
-with the program's Python.
+"""Third-party programs, started as their users start them: `program_clients.py PROGRAM PORT`, with
+the program's Python.
 
 Each function runs one program with constant pictures. It prints as JSON the "executed" rows of the
 robot, and the input that a policy should have received, in this package's terms: "state" by name,

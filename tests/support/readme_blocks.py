@@ -169,7 +169,7 @@ def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST, *, page: str = "RE
     if block.file is not None:
         (cwd / block.file).write_text(source.lstrip())
         return
-    # not onnx.py, for example, which would hide the package
+    # Not onnx.py, for example, which would hide the package.
     script = cwd / f"{page}_page.{'py' if block.language in PYTHON else 'sh'}"
     env = ENV | {"PATH": f"{_BIN}{os.pathsep}{ENV['PATH']}", "HOME": str(cwd)}
     script.write_text(source)

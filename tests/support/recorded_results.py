@@ -1,5 +1,5 @@
-"""Folders of results like an evaluation writes them, without running episodes, for tests of readers
-of results.
+"""Folders of results in the form in which an evaluation writes them, without running episodes, for
+tests of readers of results.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ WITHOUT_IMAGE = {"robocasa", "calvin"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 _PLUGIN_FILES = sorted(ROOT.glob("plugins/vlagents_ray_*/pyproject.toml"))
 PLUGINS = [tomllib.loads(file.read_text())["project"] for file in _PLUGIN_FILES]
-# for Python 3.11 only; "all" installs the plug-ins
+# For Python 3.11 only; "all" installs the plug-ins.
 OF_DEVELOPMENT = {"all", "check", "docs", "dev"}
 # Extras of the plug-ins, with the requirements of their distribution. No two distributions have an
 # extra of the same name.
@@ -59,7 +59,7 @@ def direct(extra: str | None) -> list[str]:
         if wanted.name != PROJECT["name"]:
             found.append(text)
             continue
-        # sorted, since the order of a set differs between processes
+        # Sorted, since the order of a set differs between processes.
         for name in sorted(wanted.extras):
             found += direct(name)
     return list(dict.fromkeys(found))
@@ -81,7 +81,7 @@ def overrides(requirements: Sequence[str]) -> list[str]:
 
 
 def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[str, Any]]:
-    """Return the resolved packages like in a `pylock.toml`, with `name`, `version`, and the
+    """Return the resolved packages as in a `pylock.toml`, with `name`, `version`, and the
     `wheels` for the platform.
 
     Raises:

@@ -26,7 +26,7 @@ from vlagents_ray.policies.scripted import Scripted
 
 
 class Reacher(Agent):
-    """A policy written like in the paper, without regard to sessions: its state is in attributes,
+    """A policy written as in the paper, without regard to sessions: its state is in attributes,
     some of them mutable.
     """
 
@@ -201,7 +201,7 @@ class Accountant(Agent):
         if not kwargs.get("count"):
             return {}
         gc.collect()
-        # return free memory to the system, so that only memory in use is counted
+        # Return free memory to the system, so that only memory in use is counted.
         ctypes.CDLL(None).malloc_trim(0)
         process = psutil.Process()
         return {

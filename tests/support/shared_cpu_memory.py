@@ -31,7 +31,7 @@ class ReaderCounts:
     """Torch's reference counts of the readers of memory that this process has sent."""
 
     def __init__(self) -> None:
-        # Readers keep the files of counts open by name. So names are never reused, like in torch.
+        # Readers keep the files of counts open by name. So names are never reused, as in torch.
         self.name = f"/readers_{os.getpid()}_{next(_FILES)}"
         self.next = 0
         self.limbo: list[tuple[int, Any]] = []  # slots and their storages

@@ -41,7 +41,7 @@ class TorchCalls(TorchDispatchMode):
         self.calls = 0  # calls except views
         self.launches = 0  # the same, but a function of `_ONE_KERNEL` counts once
         self.uploads = 0  # asynchronous copies from pinned memory of the CPU
-        # number of times that Python waits for the GPU, by function
+        # Number of times that Python waits for the GPU, by function.
         self.waits: Counter[str] = Counter()
 
     def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:

@@ -34,7 +34,7 @@ PAGES = ROOT / "docs" / "policies"
 PAGE = PAGES / "verification.md"
 PYTHON = "3.11"  # Python of this project's own environment
 BEGIN, END = "<!-- verified -->", "<!-- /verified -->"
-# the properties, which the page explains and which are its columns
+# The properties, which the page explains and which are its columns.
 WHAT = ("parity", "batches", "isolation", "loading", "size")
 PLUGINS = ("arro",)  # wrappers of packages in plugins/ that have a page among the policies' pages
 FURTHER_PAGES = (*PLUGINS, PAGE.stem)  # pages that belong to no policy

@@ -89,7 +89,7 @@ def require_everything(printed: dict[str, Any], *, rollouts: bool) -> None:
         assert sorted(actions) == ["handle", "http", "plasma", "shm", "websocket"]
         [first, *others] = actions.values()
         assert all(action == first for action in others), actions
-    # the state (0, 1, 2, 3) times the weights
+    # The state (0, 1, 2, 3) times the weights.
     assert printed["actions"]["onnx"]["http"] == [3.0, 4.0, 5.0]
     assert printed["evaluated"] == 2
     assert (printed["collected"] > 0) == rollouts

@@ -261,7 +261,7 @@ def test_what_changes_nothing_is_refused_unless_allowed() -> None:
     with pytest.raises(UnchangedWeights, match="got 3 equal ones"):
         fitted(HELD, same)
     assert fitted(HELD, same, allow_same=True)
-    # one value suffices for values that share memory
+    # One value suffices for values that share memory.
     assert fitted(HELD, same | {"n": np.int64(7)})
 
 

@@ -148,7 +148,7 @@ def test_a_grippers_command_is_turned_to_their_polarity() -> None:
     libero = presets()["openpi-libero"].rows(action, ours)
     assert libero[:, 6].tolist() == [-1, 1]
     assert action[:, 6].tolist() == [1, 0]
-    # the clients of these presets convert the gripper for LIBERO themselves
+    # The clients of these presets convert the gripper for LIBERO themselves.
     for openvla in ("openvla", "openvla-oft"):
         assert presets()[openvla].rows(action, ours).tolist() == action.tolist()
         assert presets()[openvla].rows(

@@ -179,7 +179,7 @@ def one_sentence(done: subprocess.CompletedProcess[str]) -> str:
 
 
 @pytest.mark.hosts
-# no episode fits; some episodes fit; most episodes fit
+# No episode fits; some episodes fit; most episodes fit.
 @pytest.mark.parametrize("size", ["64k", "300k", "600k"])
 def test_a_full_disk_costs_nothing_that_was_recorded(
     size: str, config: Config, tmp_path: Path

@@ -96,7 +96,7 @@ def test_nothing_is_fetched_from_anywhere(page: Read) -> None:
 def test_what_policies_and_simulators_say_is_text(page: Read) -> None:
     assert len(page.all("script")) == 1
     assert all("onerror" not in attributes for attributes in page.all("img"))
-    # in the instruction, the policy error, the failure and the protocol.
+    # In the instruction, the policy error, the failure and the protocol.
     assert page.words.count(" ".join(HOSTILE.split())) >= 4
 
 
@@ -302,7 +302,7 @@ def test_baselines_stand_before_checkpoints_and_are_a_level_line_in_the_learning
     assert "base (no steps)" in words
     assert "training step" in words
     assert "version of the weights" not in words
-    # in the table of numbers, where it has no step
+    # In the table of numbers, where it has no step.
     assert re.search(r"base \(no steps\) \N{EN DASH} \d", words)
     words = page.section("Comparison")
     first = [

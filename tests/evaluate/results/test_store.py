@@ -303,7 +303,7 @@ def test_a_checkpoint_has_the_same_weights_in_all_tasks(config: Config) -> None:
                 store.record(other, attempts=1)
     with Store(resolve(again)) as store:
         store.begin_run({})
-        # a checkpoint that the task selects
+        # A checkpoint that the task selects.
         store.record(replace(other, checkpoint="runs/other"), attempts=1)
 
 

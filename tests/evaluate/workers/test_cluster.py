@@ -114,7 +114,7 @@ def test_a_process_knows_the_files_that_it_writes_to(tmp_path: Path) -> None:
 def test_another_node_reads_its_own_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "log").write_text("from there")
     monkeypatch.setattr(socket, "gethostname", lambda: "here")
-    # a busy machine takes long to start the process that reads
+    # A busy machine takes long to start the process that reads.
     monkeypatch.setattr(cluster, "TIMEOUT_S", 120.0)
     [node] = ray.nodes()
     reads = []

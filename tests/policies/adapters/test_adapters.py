@@ -108,7 +108,7 @@ def test_passes_of_two_threads_each_have_the_adapters_of_their_rows(tmp_path: Pa
         found[name] = begun(policy, 0, adapter=name).act(at(0)).action
 
     wanted = {name: begun(policy, 0, adapter=name).act(at(0)).action for name in ("stack", "pour")}
-    # here one thread's adapters would apply to both before both threads have used them
+    # Without isolation, both threads would use one thread's adapters in these layers.
     for place in (0, 2):
         policy.model["head"][place].register_forward_pre_hook(meet)
     threads = [threading.Thread(target=act, args=[name]) for name in wanted]

@@ -298,7 +298,7 @@ def test_padding_has_no_observations_of_its_own() -> None:
     for session in sessions:
         session.reset(at(0.0), "go")
     acts = policy.act_batch([at(0.0, **{SAMPLES: 3}), at(1.0)], sessions)
-    # two views instead of eight rows
+    # Two views instead of eight rows.
     assert [set(act.action.ravel()) for act in acts] == [{2}, {2}]
 
 

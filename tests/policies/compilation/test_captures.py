@@ -276,7 +276,7 @@ def test_the_graphs_of_a_policy_share_memory_and_the_largest_is_made_first(cuda:
     assert compilation.graph_bytes > cuda.reserved[0], "the inputs also take memory"
     compiled(cuda, torch.tanh)
     assert len({id(graph.pool) for graph in cuda.captures}) == 2
-    # each replay overwrites the results of all other graphs in the pool
+    # Each replay overwrites the results of all other graphs in the pool.
     for rows in (1, 2, 3, 4, 2):
         x = numbers(cuda, rows)
         first, (second, third), again, _ = act(x)
@@ -593,7 +593,7 @@ def test_what_a_load_beside_acts_defers_is_loaded_when_no_request_comes(
     try:
         submit(engine, "a", Request("reset", Obs(), kwargs={"checkpoint": "other"}), replies.put)
         assert replies.get(timeout=10).error is None
-        with engine.weights.acting_lock:  # like during a batch, or while the policy sleeps
+        with engine.weights.acting_lock:  # as during a batch, or while the policy sleeps
             monkeypatch.setattr(model_manager, "QUIET_S", 0.05)
             with pytest.raises(queue.Empty):
                 parts.get(timeout=0.2)

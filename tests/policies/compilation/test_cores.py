@@ -646,7 +646,7 @@ def test_a_cache_that_cannot_be_written_is_no_error(
     assert "compiled programs are not kept" in caplog.text
 
 
-# a warning of torch's own compiler
+# A warning of torch's own compiler.
 @pytest.mark.filterwarnings("ignore:`torch.jit.:DeprecationWarning")
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
 def test_a_program_is_compiled_once_and_found_at_the_next_start(cache: Path) -> None:

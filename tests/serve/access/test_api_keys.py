@@ -509,7 +509,7 @@ def test_a_reset_stands_in_the_audit_log_with_its_key_and_its_session(
 def test_a_replica_writes_the_audit_log_where_nobody_has_set_up_logging(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # like in a process whose root logger has no handlers
+    # As in a process whose root logger has no handlers.
     monkeypatch.setattr(audit.logger, "propagate", False)
     monkeypatch.setattr(audit.logger, "handlers", [])
     monkeypatch.setattr(audit.logger, "level", logging.NOTSET)

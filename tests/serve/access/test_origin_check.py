@@ -63,6 +63,6 @@ def test_a_page_is_ours_at_its_address_alone() -> None:
     for page in ("https://evil.example", "null", "http://[", "http://127.0.0.1:9000"):
         with pytest.raises(Forbidden, match="origin"):
             require_own_page({"host": "127.0.0.1:8000", "origin": page})
-    # an origin with a host name is rejected, even if the operator has configured the name
+    # An origin with a host name is rejected, even if the operator has configured the name.
     with pytest.raises(Forbidden):
         require_own_page({"host": "a.example", "origin": "http://a.example"}, ["a.example"])

@@ -191,7 +191,7 @@ def test_without_keys_pages_of_other_sites_are_refused(endpoint: Endpoint) -> No
         assert own.get("/v1/metadata", {"origin": "https://evil.example"})[0] == 403
         assert own.get("/v1/metadata", {"origin": own.url})[0] == 200
         rebound = {"origin": "http://evil.example:8000", "host": "evil.example:8000"}
-        # another site's name that resolves to this machine
+        # Another site's name that resolves to this machine.
         assert own.get("/v1/metadata", rebound)[0] == 403
         with (
             pytest.raises(InvalidStatus) as refused,

@@ -390,7 +390,7 @@ def test_a_deadline_that_passed_is_504(client: TestClient) -> None:
         while not acts:
             answer = post(slow, "act", headers={"x-deadline-ms": "30"})
         assert (answer.status_code, answer.json()["code"]) == (504, "outcome_unknown")
-        # this act waits behind the first one
+        # This act waits behind the first one.
         answer = post(slow, "act", headers={"x-deadline-ms": "30"})
         assert (answer.status_code, answer.json()["code"]) == (504, "deadline_exceeded")
         gate.set()

@@ -136,7 +136,7 @@ def test_a_message_in_fragments_is_answered_as_a_whole_one(
 def test_many_small_fragments_end_their_connection(endpoint: OwnPortServer) -> None:
     url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
     with connect(url, compression=None) as client:
-        # the server may close the connection before the last fragment is sent
+        # The server may close the connection before the last fragment is sent.
         with suppress(ConnectionClosed):
             client.send([b"a"] * 50)
         with pytest.raises(ConnectionClosed, match="small fragments"):
@@ -171,7 +171,7 @@ def test_a_client_that_takes_no_replies_holds_up_nobody(
     frame = encode_requests(
         [Request("act", Obs({"front": np.zeros((2, 2, 3), np.uint8)}, info={"bytes": 3_000_000}))]
     )
-    # on a busy machine the server may close the connection before the last byte is sent
+    # On a busy machine the server may close the connection before the last byte is sent.
     with suppress(ConnectionClosed, OSError):
         for _ in range(4):
             slow.send(frame, 5)
@@ -293,7 +293,7 @@ def test_a_replica_that_stops_closes_its_connections_with_a_code_and_a_reason() 
         waiting.send(encode_requests([Request("reset", Obs())]))
         assert decode_replies(waiting.recv(5))[0].error is None
         engine.close()
-        # the server does not read this message
+        # The server does not read this message.
         waiting.send(encode_requests([Request("act", Obs())]))
         endpoint.close()
         for client in (idle, waiting):

@@ -671,7 +671,7 @@ def test_a_swap_without_room_takes_that_of_a_choice(
     assert reset(engine, "another") == "a/1"
     gate.set()
     wait_for(lambda: state(engine) is None)
-    # these were the last sessions that kept the old checkpoint in memory
+    # These were the last sessions that kept the old checkpoint in memory.
     for session in ("own", "another"):
         ask(engine, session, "close").get(timeout=10)
     assert reset(engine, "own") == "b/2"

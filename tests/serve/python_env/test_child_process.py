@@ -375,7 +375,7 @@ def test_what_the_child_does_on_its_gpu_is_in_the_metrics_of_the_replica() -> No
         collected = engine.collect_stats()
         assert collected.gpu_ms.values == [3.5, 4.5]
         assert (collected.out_of_memory, collected.replays) == (1, 4)
-        assert engine.stats.gpu_ms == 4.5, "of the live page"
+        assert engine.stats.gpu_ms == 4.5, "the live page must show the latest value"
         assert engine.stats.replays == CudaGraph.replays + 4
 
         nothing_new = engine.collect_stats()

@@ -380,7 +380,7 @@ def test_no_descriptor_and_no_thread_is_left() -> None:
 def test_who_wakes_a_closed_poller_writes_into_no_other_file() -> None:
     poller = Poller()
     poller.close()
-    # these may have the same descriptor numbers as the closed sockets
+    # These may have the same descriptor numbers as the closed sockets.
     ours, theirs = socket.socketpair()
     poller.wake()
     ours.setblocking(False)

@@ -139,7 +139,9 @@ def test_a_robot_that_is_not_admitted_asks_when_its_rows_have_run_out() -> None:
 def test_the_robots_of_one_key_do_not_make_those_of_another_wait(
     hog: RobotNeed, first: bool
 ) -> None:
-    """The number of robots, their declared needs and their order of arrival do not matter."""
+    """A key's share does not depend on the number of the other key's robots, on their declared
+    needs, or on the order of arrival.
+    """
     theirs, ours = stated(hog, 2000, "hog/"), stated(OF_8, 8, "lab/")
     robots = Robots(*theirs)
     robots.read()

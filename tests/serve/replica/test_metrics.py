@@ -133,7 +133,7 @@ def test_the_number_of_series_does_not_grow_with_the_robots(
 
     monkeypatch.setattr(metrics, "series", series)
     monkeypatch.setattr(metrics, "_PAUSE_S", 0.0)
-    # other tests of this process may have replayed graphs
+    # Other tests of this process may have replayed graphs.
     monkeypatch.setattr(CudaGraph, "replays", 0)
     engine = Engine(Noop.from_config({}), EngineSettings(threaded=False))
     engine.start()
