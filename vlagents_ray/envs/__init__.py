@@ -1,4 +1,4 @@
-"""Environments to evaluate policies in: one file or folder for each simulator."""
+"""Environments for evaluating policies, with one file or folder for each simulator."""
 
 from vlagents_ray.envs.base import EvalEnv, make_env
 

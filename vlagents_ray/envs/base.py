@@ -1,4 +1,4 @@
-"""The interfaces of a single environment and of several that step together."""
+"""The interfaces of a single environment, and of several environments that step together."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 Options = Mapping[str, Any]
-# The success of an episode: after any of its steps, or after the last one.
+# When success counts: after any step of an episode, or only after the last step.
 Metric = Literal["success_once", "success_at_end"]
-# Observations, rewards, terminated, truncated and infos of one step of several environments.
+# Observations, rewards, terminated, truncated and infos of one step in several environments.
 Steps = tuple[list[Obs], list[float], list[bool], list[bool], list[dict[str, Any]]]
 
 
@@ -47,16 +47,16 @@ class Environment(ABC):
     looked_at: bool = True
     """Whether the images of the next observation are used; if not, an env may omit them.
 
-    Images between the rows of a chunk are not used unless videos are made, and neither are those of
-    the last step. Nothing but the images may depend on this.
+    Unless videos are recorded, images between the rows of a chunk and images of the last step are
+    not used. Only the images may depend on this attribute.
     """
 
     several_tasks: bool = False
     """Whether an episode is a sequence of tasks, as in CALVIN, so that a step may change the
     instruction.
 
-    An evaluation then resets the policy with the new instruction and with the observation of that
-    step, which has images even if `looked_at` is False. The other rows of the chunk are dropped.
+    An evaluation then resets the policy with the new instruction and the observation of this step,
+    which has images even if `looked_at` is False. The remaining rows of the chunk are dropped.
     """
 
     @property
@@ -65,14 +65,16 @@ class Environment(ABC):
         """The observations (cameras, state, gripper, rate) and the actions of each environment."""
 
     def renderer(self) -> Renderer | None:
-        """Return the device that renders the images; None before it is made.
+        """Return the device that renders the images; None before the device is chosen.
 
-        By default it is the device of this thread's OpenGL context.
+        By default, it is the device of this thread's OpenGL context.
         """
         return opengl_renderer()
 
     def describe(self) -> dict[str, Any]:
-        """Return facts that readers of results need: versions, control mode, render backend."""
+        """Return a description that readers of results need: versions, control mode, render
+        backend.
+        """
         return {}
 
     @abstractmethod
@@ -87,7 +89,7 @@ class Environment(ABC):
 
 
 class EvalEnv(Environment):
-    """The interface of an environment, which a worker makes once and resets for each episode.
+    """The interface of an environment, which a worker creates once and resets for each episode.
 
     An episode is a pure function of its seed and options: two resets with the same seed and options
     return the same first observation, in any process and after any other episodes.
@@ -106,12 +108,12 @@ class EvalEnv(Environment):
 
         Args:
             seed: The seed of the episode.
-            options: The options of the episode, e.g. `init_state` (int); those allowed depend on
-                the env.
+            options: The options of the episode, e.g. `init_state` (int); each env defines the
+                options that it accepts.
 
         Returns:
-            The first observation, and information about the episode with values that a message can
-            carry.
+            The first observation, and information about the episode, whose values can be sent in a
+            message.
 
         Raises:
             ConfigError: An option is unknown or has a wrong value.
@@ -127,10 +129,10 @@ class EvalEnv(Environment):
                 changed.
 
         Returns:
-            `(obs, reward, terminated, truncated, info)`, with the meaning of Gymnasium's
+            `(obs, reward, terminated, truncated, info)`, with the same meaning as in Gymnasium's
             `Env.step`. `info["success"]` is a bool: whether the task is solved in this state. An
-            env may continue after success; `terminated` only reports that it cannot continue.
-            `truncated` means that `max_steps` is reached.
+            env may continue after success; `terminated` only reports that the env cannot continue,
+            and `truncated` reports that `max_steps` is reached.
 
         Raises:
             InvalidAction: The action has a wrong shape or is not finite.
@@ -139,7 +141,7 @@ class EvalEnv(Environment):
 
     @classmethod
     def tasks(cls) -> list[str]:
-        """List the known tasks; empty if the simulator accepts any name."""
+        """Return the names of the known tasks; empty if the simulator accepts any name."""
         return list(cls.known)
 
     @classmethod
@@ -147,21 +149,21 @@ class EvalEnv(Environment):
         """Check that a task exists, as far as that is possible without the simulator.
 
         Args:
-            task: The part of the env's name after the first slash; None if it has none, which is
-                no error where the constructor has a default.
+            task: The part of the env's name after the first slash; None if the name has no slash,
+                which is valid if the constructor has a default task.
 
         Raises:
             UnknownEnv: The task does not exist.
         """
 
     @classmethod
-    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract | None:  # noqa: ARG003 - for those that override it
-        """Return the contract of an environment before it is made.
+    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract | None:  # noqa: ARG003
+        """Return the contract of an environment before the environment is created.
 
-        With it, a mismatch with a policy is an error before anything starts.
+        An evaluation can then report a mismatch with a policy before any process starts.
 
         Args:
-            arguments: All arguments of the constructor by name, defaults included.
+            arguments: All arguments of the constructor by name, including defaults.
 
         Returns:
             The contract; None if only the simulator knows it.
@@ -170,19 +172,22 @@ class EvalEnv(Environment):
 
     @classmethod
     def missing(cls) -> str | None:
-        """Return why the simulator cannot run here, with the cure; None if it can."""
+        """Return the reason why the simulator cannot run here, with the cure; None if it can
+        run.
+        """
         return None
 
     @classmethod
-    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:  # noqa: ARG003 - for those that override it
-        """Make several environments that one simulator runs together.
+    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:  # noqa: ARG003
+        """Create several environments that one simulator runs together.
 
         Args:
             num_envs: The number of environments.
             options: The constructor's options.
 
         Returns:
-            The environments; None if the simulator cannot run several with these options.
+            The environments; None if the simulator cannot run several environments with these
+            options.
         """
         return None
 
@@ -190,18 +195,19 @@ class EvalEnv(Environment):
 class BatchEnv(Environment):
     """Several environments of one task, which differ only in their episodes.
 
-    They begin and step together: an environment whose episode is over is idle, and its rows have no
-    meaning, until all episodes are over and `reset` begins the next ones. Row i of every argument
-    and result belongs to environment i. Its episode is a pure function of its seed and options, as
-    in `EvalEnv`, and does not depend on the other environments.
+    The environments begin and step together. An environment whose episode is over is idle, and its
+    rows have no meaning, until all episodes are over and `reset` begins the next episodes. Row i of
+    every argument and result belongs to environment i. An episode is a pure function of its seed
+    and options, as in `EvalEnv`, and does not depend on the other environments.
 
-    The images of a camera in one step are rows of one array, (num_envs, height, width, 3) uint8.
+    The images of a camera in one step are the rows of one array, (num_envs, height, width, 3)
+    uint8.
     """
 
     num_envs: int
     """The number of environments."""
 
-    # Whether `restart` can begin an episode in one environment while the others continue theirs.
+    # Whether `restart` can begin an episode in one environment while the other episodes continue.
     restarts: bool = False
 
     @property
@@ -225,7 +231,7 @@ class BatchEnv(Environment):
         """
 
     def restart(self, index: int, *, seed: int, options: Options | None = None) -> Obs:
-        """Begin the next episode in one environment while the others continue theirs.
+        """Begin the next episode in one environment while the other episodes continue.
 
         Args:
             index: The number of the environment.
@@ -236,7 +242,7 @@ class BatchEnv(Environment):
             The first observation.
 
         Raises:
-            ConfigError: `restarts` is false.
+            ConfigError: `restarts` is False.
         """
         raise ConfigError(
             f"env {index}: {type(self).__name__} resets its environments together; use `reset`"
@@ -247,20 +253,20 @@ class BatchEnv(Environment):
         """Execute an action in each episode.
 
         Args:
-            acts: A single action, (D,) float32, for each episode; None for an idle environment.
+            acts: A single action, (D,) float32, for each environment; None for an idle environment.
 
         Returns:
-            `(obs, rewards, terminated, truncated, infos)`, one item for each episode (see
-            `EvalEnv.step`).
+            `(obs, rewards, terminated, truncated, infos)`, each with one item for each environment
+            (see `EvalEnv.step`).
 
         Raises:
-            InvalidAction: An action is not valid; none was executed.
+            InvalidAction: An action is not valid; no action was executed.
             EnvFailed: The simulator failed, which ends all episodes.
         """
 
 
 def make_env(name: str, **options: Any) -> EvalEnv:
-    """Make an environment by its name, e.g. `make_env("maniskill/PushCube-v1", width=224)`.
+    """Create an environment from its name, e.g. `make_env("maniskill/PushCube-v1", width=224)`.
 
     Args:
         name: A registered name, with the task after a slash, or "module:Class".
@@ -271,7 +277,7 @@ def make_env(name: str, **options: Any) -> EvalEnv:
 
     Raises:
         UnknownEnv: The name or the task is unknown.
-        ConfigError: The env has no such option, or its value is wrong.
+        ConfigError: An option is unknown, or its value is wrong.
         MissingDependency: The simulator is not installed.
         EnvFailed: The simulator or its assets cannot be loaded.
     """
@@ -283,7 +289,7 @@ def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv],
     """Return the class of the env `name`, and the arguments of its constructor.
 
     Raises:
-        VLAgentsError: The errors of `make_env`, as far as they are known without the simulator.
+        VLAgentsError: The errors of `make_env` that can be detected without the simulator.
     """
     cls = env_class(name)
     if not issubclass(cls, EvalEnv):
@@ -299,10 +305,10 @@ def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv],
 
 
 def known_contract(name: str, options: Mapping[str, Any]) -> Contract | None:
-    """Return the contract of the env `name` without making it.
+    """Return the contract of the env `name` without creating the env.
 
     Returns:
-        The contract; None if it is known only once the simulator runs.
+        The contract; None if only the running simulator knows it.
 
     Raises:
         VLAgentsError: The errors of `env_arguments`.
@@ -324,14 +330,14 @@ DELTA_POSE = ActionSpec(
     low=-1.0,
     high=1.0,
 )
-"""A change of the end effector's pose, and the gripper, as in robosuite.
+"""The description of robosuite's actions: a change of the end effector's pose, and the gripper.
 
-Other environments replace a few fields.
+Environments with other actions replace a few fields.
 """
 
 
 def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> None:
-    """Raise `ConfigError` unless an env has the cameras of these names."""
+    """Raise `ConfigError` unless an env has the cameras with these names."""
     unknown = sorted(set(names) - set(have))
     if unknown:
         raise ConfigError(f"{env}: expected cameras of {sorted(have)}, got {unknown}")
@@ -360,20 +366,20 @@ def one_row(act: Act, contract: Contract) -> np.ndarray:
 
 
 def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
-    """Make several environments as `make_env` does.
+    """Create several environments like `make_env`.
 
-    They share one simulator if the suite supports that with these options.
+    They share one simulator if the suite supports this with the given options.
 
     Args:
-        name: As for `make_env`.
+        name: As in `make_env`.
         num_envs: The number of environments.
-        options: As for `make_env`.
+        options: As in `make_env`.
 
     Returns:
         The environments, which the caller closes.
 
     Raises:
-        ConfigError: `num_envs` is below 1, or an option is wrong; other errors are those of
+        ConfigError: `num_envs` is below 1, or an option is wrong; also raises the other errors of
             `make_env`.
     """
     if num_envs < 1:
@@ -385,32 +391,33 @@ def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
     if batch is not None:
         return batch
 
-    # Close those that were made if a later one fails.
+    # If an environment cannot be created, close the environments created before.
     with ExitStack() as closing:
         envs = [closing.enter_context(cls(**arguments)) for _ in range(num_envs)]
         closing.pop_all()
         return SequentialBatch(envs)
 
 
-# Key of the exception in the info of an environment whose step failed, while others succeeded.
+# Key, in the info of an environment whose step failed, of the exception; other environments may
+# have succeeded.
 ERROR = "error"
 
 
 class SequentialBatch(BatchEnv):
     """Environments that are stepped one after another, with one call of the policy for all of them.
 
-    If the step of one of several environments raises an exception, such as `InvalidAction`, its
-    info contains the exception as `ERROR`, and the others are still stepped: an episode does not
-    depend on the episodes of other environments.
+    If one of several environments raises an exception in its step, such as `InvalidAction`, its
+    info contains the exception under the key `ERROR`, and the other environments are still stepped:
+    an episode does not depend on the episodes of other environments.
     """
 
     restarts = True
 
     def __init__(self, envs: Sequence[EvalEnv]) -> None:
-        """Combine environments of one task, which are closed together with this object."""
+        """Combine environments of one task; closing this object closes them."""
         self.several_tasks = envs[0].several_tasks
         self._envs = list(envs)
-        self._playing = 0  # the number of environments, from the first, that have an episode
+        self._playing = 0  # number of environments with an episode; these are the first ones
         self._last_obs: list[Obs] = []  # the last observation of each environment
         self.num_envs = len(self._envs)
         self.max_steps = self._envs[0].max_steps
@@ -450,7 +457,7 @@ class SequentialBatch(BatchEnv):
                 f"got {count}"
             )
         moving = {i: act for i, act in enumerate(acts) if act is not None}
-        if count > 1:  # A single environment checks its action itself.
+        if count > 1:  # A single environment checks its own action.
             for act in moving.values():
                 one_row(act, self.contract)
 
@@ -489,7 +496,7 @@ class SequentialBatch(BatchEnv):
         return facts if self.num_envs == 1 else {**facts, "num_envs": self.num_envs}
 
     def close(self) -> None:
-        """Close all environments, also if one of them raises an exception."""
+        """Close all environments, even if one of them raises an exception."""
         with ExitStack() as closing:
             for env in self._envs:
                 closing.callback(env.close)
@@ -497,9 +504,9 @@ class SequentialBatch(BatchEnv):
     def _stacked(self, observations: list[Obs], moved: Collection[int]) -> list[Obs]:
         """Return the observations with the images of each camera as rows of one array.
 
-        If images are not used, or if nothing moved, the observations are returned unchanged. An
-        idle environment may have omitted its images when it last moved. Images of an environment
-        that moved then replace them.
+        If images are not used, or if no environment was stepped, the observations are returned
+        unchanged. An idle environment may have omitted the images of its last step; images of a
+        stepped environment then replace them.
         """
         if len(observations) == 1 or not moved or not self.looked_at:
             return observations
@@ -536,7 +543,7 @@ def episodes_of(seeds: Sequence[int], num_envs: int) -> int:
     """Return the number of episodes that `seeds` begin.
 
     Raises:
-        ConfigError: There are more seeds than environments, or none.
+        ConfigError: There are more seeds than environments, or no seeds.
     """
     if not 1 <= len(seeds) <= num_envs:
         raise ConfigError(
@@ -547,5 +554,5 @@ def episodes_of(seeds: Sequence[int], num_envs: int) -> int:
 
 
 def kind_of(answer: object) -> str:
-    """Return what an environment answered, for an error message."""
+    """Return a description of an environment's result, for an error message."""
     return f"a tuple of {len(answer)}" if isinstance(answer, tuple) else type(answer).__name__

@@ -1,11 +1,11 @@
 """The choice of the device that renders an env's images.
 
-Ray sets CUDA_VISIBLE_DEVICES to the GPU of a worker, but neither EGL nor Vulkan reads it. Each
-would use its first device, which may be the GPU that a policy uses. If CUDA_VISIBLE_DEVICES is set,
-this module therefore chooses the device, and checks that it is used.
+Ray sets CUDA_VISIBLE_DEVICES to the GPU of a worker, but neither EGL nor Vulkan reads it. Both
+would use their first device, which may be the GPU of a policy. Therefore, if CUDA_VISIBLE_DEVICES
+is set, this module chooses the device, and checks that the simulator uses it.
 
-The probes render one frame in a child process with a time-out, because a broken driver may hang or
-crash the process that loads it. Their results are cached for the life of the process.
+The probes render one frame in a child process with a timeout, because a broken driver may hang or
+crash the process that loads it. The results are cached for the lifetime of the process.
 
     probe = render_probe()                  # Vulkan, as SAPIEN (ManiSkill 3) uses it
     probe.ok, probe.device, probe.cure      # True, "llvmpipe (LLVM 15.0.6, 256 bits)", None
@@ -33,14 +33,14 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import how_to_install
 
 _MOST_DEVICES = 64
-# Constants of EGL's and OpenGL's headers.
-_EXTENSIONS = 0x3055  # string of a device: its extensions
-_DEVICE = 0x322C  # attribute of a display: its device
-_CUDA_DEVICE = 0x323A  # attribute of a device: its CUDA number
-_GL_RENDERER = 0x1F01  # string of a context: the name of the device
+# Constants from the headers of EGL and OpenGL.
+_EXTENSIONS = 0x3055  # query of a device: its extensions, a string
+_DEVICE = 0x322C  # query of a display: its device, an attribute
+_CUDA_DEVICE = 0x323A  # query of a device: its CUDA number, an attribute
+_GL_RENDERER = 0x1F01  # query of a context: the name of its device, a string
 _SOFTWARE = "EGL_MESA_device_software"
 _CUDA = "EGL_NV_device_cuda"
-_Value = ctypes.c_ssize_t  # EGLAttrib
+_Value = ctypes.c_ssize_t  # type EGLAttrib
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +49,13 @@ class EglDevice:
 
     number: int  # index in EGL's order, as in MUJOCO_EGL_DEVICE_ID
     software: bool
-    # Index among the CUDA devices that this process may use; None if it is not one of them.
+    # Index among the CUDA devices that this process may use; None if the device is not one of
+    # these.
     cuda: int | None
 
 
 def devices() -> list[EglDevice]:
-    """List all devices in EGL's order; empty if EGL is missing or too old."""
+    """Return all devices in EGL's order; empty if EGL is missing or too old."""
     functions = _functions()
     return [] if functions is None else [device for _, device in functions.devices()]
 
@@ -71,7 +72,7 @@ class _Functions:
         self.library.eglGetProcAddress.argtypes = [ctypes.c_char_p]
         self.library.eglGetCurrentDisplay.restype = ctypes.c_void_p
 
-        # Each function with the type of its result and the types of its arguments.
+        # Look up each function, with the type of its result and the types of its arguments.
         pointers, integers = ctypes.POINTER(ctypes.c_void_p), ctypes.POINTER(ctypes.c_int)
         self._query = self._extension(
             "eglQueryDevicesEXT", ctypes.c_uint, ctypes.c_int, pointers, integers
@@ -85,7 +86,7 @@ class _Functions:
         self.gl_string = self._extension("glGetString", ctypes.c_char_p, ctypes.c_uint)
 
     def devices(self) -> list[tuple[int | None, EglDevice]]:
-        """List all devices in EGL's order, each with its handle."""
+        """Return all devices in EGL's order, each with its handle."""
         handles, number = (ctypes.c_void_p * _MOST_DEVICES)(), ctypes.c_int()
         if not self._query(_MOST_DEVICES, handles, ctypes.byref(number)):
             return []
@@ -126,10 +127,10 @@ EGL_DEVICE = "MUJOCO_EGL_DEVICE_ID"
 # Variables that name the files of Vulkan drivers. SAPIEN's older loader only reads the first.
 VULKAN_DRIVERS = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")
 _ICD_FOLDERS = ("/usr/local/share/vulkan/icd.d", "/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
-# Part of the path to SAPIEN's description of NVIDIA's driver. SAPIEN sets it in the variables above
-# if it finds no other driver.
+# Part of the path of SAPIEN's own description of NVIDIA's driver. SAPIEN sets this path in the
+# variables above if it finds no other driver.
 _SAPIENS_OWN = "sapien/vulkan_library/"
-_SOFTWARE_VULKAN = "llvmpipe"  # lavapipe's name of its device
+_SOFTWARE_VULKAN = "llvmpipe"  # beginning of the name of lavapipe's device
 
 SHARE = "worker: {gpus: 0.25}, or --worker-gpus 0.25, gives each worker a part of a GPU"
 _CURE_HIDDEN = (
@@ -146,14 +147,15 @@ _CURE_OWN = (
 
 @dataclass(frozen=True, slots=True)
 class Renderer:
-    """The device that renders an env's images."""
+    """A device that renders an env's images."""
 
     # The driver's name of the device: "llvmpipe (LLVM 15.0.6, 256 bits)", "NVIDIA H200/PCIe/SSE2".
     name: str
     software: bool
-    # Index among the CUDA devices that this process may use; None if it is not one of them.
+    # Index among the CUDA devices that this process may use; None if the device is not one of
+    # these.
     cuda: int | None
-    asked_for: bool = False  # whether the environment's options name this device
+    asked_for: bool = False  # whether the environment's options select this device
 
 
 def has_gpu() -> bool | None:
@@ -163,14 +165,15 @@ def has_gpu() -> bool | None:
 
 
 def fitting(devices: Sequence[EglDevice], *, gpu: bool) -> EglDevice | None:
-    """Return the device to render on.
+    """Return the device on which to render.
 
     Args:
         devices: The devices of EGL.
         gpu: Whether to render on a GPU.
 
     Returns:
-        CUDA's first device, or without `gpu` the software device; None if there is none.
+        CUDA's first device or, if `gpu` is False, the software device; None if there is no such
+        device.
     """
     if gpu:
         gpus = [device for device in devices if device.cuda is not None]
@@ -179,19 +182,22 @@ def fitting(devices: Sequence[EglDevice], *, gpu: bool) -> EglDevice | None:
 
 
 def prepare_rendering() -> None:
-    """Set variables of drivers and simulators for rendering without a display on shared cores.
+    """Set the environment variables of drivers and simulators for rendering without a display and
+    on shared cores.
 
-    Variables set by the user are kept. Call it before any simulator is imported: ManiSkill also
-    imports MuJoCo, which chooses its OpenGL once, on import.
+    Variables set by the user are kept. Call this before any simulator is imported: ManiSkill also
+    imports MuJoCo, which chooses its OpenGL backend once, on import.
     """
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # otherwise Mesa's software drivers use all cores
+    # Otherwise Mesa's software drivers would use all cores.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
     if not os.environ.get("MUJOCO_GL") and not os.environ.get("DISPLAY") and _has_egl():
         os.environ["MUJOCO_GL"] = "egl"
     choose_devices()
 
 
 def choose_devices() -> None:
-    """Set the environment variables that select the devices, before libraries are loaded.
+    """Set the environment variables that select the devices; call this before libraries are
+    loaded.
 
     Variables set by the user are kept.
     """
@@ -214,7 +220,7 @@ def opengl_renderer() -> Renderer | None:
     """Return the renderer of this thread's OpenGL context.
 
     Returns:
-        The renderer; None if there is no context, or if EGL did not make it.
+        The renderer; None if there is no context, or if EGL did not create it.
     """
     functions = _functions()
     if functions is None:
@@ -237,8 +243,8 @@ def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> 
 
     Args:
         name: SAPIEN's name of the device.
-        cuda: Its index among the CUDA devices; None if it is not one of them.
-        asked_for: Whether the env's options named the device.
+        cuda: The index of the device among the CUDA devices; None if it is not a CUDA device.
+        asked_for: Whether the env's options select the device.
     """
     files = filter(None, map(os.environ.get, VULKAN_DRIVERS))
     driver_set = has_gpu() is False and any(_SAPIENS_OWN not in file for file in files)
@@ -246,11 +252,11 @@ def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> 
 
 
 def require_own(renderer: Renderer) -> None:
-    """Check that a renderer is a device of this process.
+    """Check that a renderer is a device that this process may use.
 
     Raises:
-        ConfigError: The renderer is not the GPU assigned to this process, or it is a GPU and none
-            is assigned.
+        ConfigError: The renderer is not the GPU assigned to this process, or it is a GPU although
+            no GPU is assigned.
     """
     gpu = has_gpu()
     if gpu is None or renderer.asked_for:
@@ -261,12 +267,12 @@ def require_own(renderer: Renderer) -> None:
 
     if gpu:
         raise ConfigError(
-            f"the worker was given the GPU {os.environ[GPUS]}, but its env renders on "
+            f"the GPU {os.environ[GPUS]} is assigned to the worker, but its env renders on "
             f"{renderer.name!r}; {_CURE_OWN}"
         )
     raise ConfigError(
-        f"the worker was given no GPU (worker.gpus: 0), but its env renders on {renderer.name!r}, "
-        f"which a policy may be using; {_CURE_HIDDEN}"
+        f"no GPU is assigned to the worker (worker.gpus: 0), but its env renders on "
+        f"{renderer.name!r}, which a policy may be using; {_CURE_HIDDEN}"
     )
 
 
@@ -289,9 +295,9 @@ def _has_egl() -> bool:
     return True
 
 
-# Probes: whether this machine can render.
+# Probes: tests whether this machine can render.
 
-TIMEOUT_S = 60.0  # a software driver compiles its shaders in 3 to 10 s
+TIMEOUT_S = 60.0  # s, time limit; a software driver compiles its shaders in 3 to 10 s
 
 VULKAN_CURE = (
     "install a Vulkan driver: Mesa 25 renders in software (Debian 12: apt-get install -t "
@@ -324,7 +330,7 @@ class RenderProbe:
     """The outcome of rendering one frame."""
 
     ok: bool
-    seconds: float  # run time of the child process, imports included
+    seconds: float  # run time of the child process, including imports
     # The driver's name of the device; "llvmpipe ..." is Mesa's software driver.
     device: str | None = None
     error: str | None = None
@@ -354,28 +360,28 @@ def vulkan_device(*, on_gpu: bool) -> tuple[str, int | None] | None:
     """Return the name and the CUDA index of the device on which SAPIEN renders in this process.
 
     Args:
-        on_gpu: Whether SAPIEN was made to render on a GPU.
+        on_gpu: Whether SAPIEN was configured to render on a GPU.
 
     Returns:
-        The device as in `usable_devices`; None if there is none.
+        The device as in `usable_devices`; None if there is no device.
     """
     import sapien.render
 
     usable = usable_devices(sapien.render.get_device_summary())
-    # The sort is stable, so that SAPIEN's order is kept among devices of the same kind.
+    # The sort is stable, so devices of the same kind stay in SAPIEN's order.
     usable.sort(key=lambda device: (device[1] is not None) != on_gpu)
     return usable[0] if usable else None
 
 
 def usable_devices(summary: str) -> list[tuple[str, int | None]]:
-    """List the supported devices in a summary of SAPIEN, in its order.
+    """Return the supported devices in a summary of SAPIEN, in the summary's order.
 
     Args:
         summary: The text that `sapien.render.get_device_summary` returns.
 
     Returns:
         The name of each device, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its index among the
-        CUDA devices of this process; None if it is not one of them.
+        CUDA devices of this process, or None if it is not a CUDA device.
     """
     usable = []
     for block in summary.split("GPU:")[1:]:
@@ -407,7 +413,7 @@ def _probed(api: Literal["vulkan", "egl"], module: str, cure: str, timeout_s: fl
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
     started = time.monotonic()
     try:
-        child = subprocess.run(  # noqa: S603 - our own interpreter and module, no outside input
+        child = subprocess.run(  # noqa: S603 - the command is this interpreter and module
             [sys.executable, "-c", f"from {__name__} import _main; _main({api!r})"],
             # SAPIEN does not read MUJOCO_GL.
             env={**os.environ, "PYTHONPATH": path, "MUJOCO_GL": "egl"},
@@ -441,7 +447,7 @@ def _render_vulkan() -> str | None:
     try:
         device = sapien.Device("cuda")
     except RuntimeError:
-        device = sapien.Device("cpu")  # any Vulkan device, software included
+        device = sapien.Device("cpu")  # any Vulkan device, including a software device
 
     scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
     scene.set_ambient_light([1.0, 1.0, 1.0])
@@ -479,7 +485,7 @@ def _require_contrast(image: object) -> None:
     import numpy as np
 
     if np.ptp(np.asarray(image)) == 0:
-        raise RuntimeError("the frame is of one colour: the driver runs but draws nothing")
+        raise RuntimeError("the frame has a single colour: the driver runs but renders nothing")
 
 
 def _main(api: str) -> None:

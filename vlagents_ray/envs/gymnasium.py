@@ -1,8 +1,9 @@
-"""Environments of Gymnasium with the interface of `EvalEnv`, and PushT with its published protocol.
+"""Gymnasium environments with the interface of `EvalEnv`, and PushT with its published protocol.
 
 An environment is named `gymnasium/<id>`, for instance `gymnasium/Pendulum-v1` or
-`gymnasium/gym_pusht/PushT-v0`. Images and vectors in the observation space are found automatically.
-An environment without images is rendered. Everything else is an option of `Gymnasium`.
+`gymnasium/gym_pusht/PushT-v0`. The adapter finds images and vectors in the observation space
+automatically, and renders an environment that has no images. All other properties are options of
+`Gymnasium`.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import pip_install, require
 
 SUCCESS_KEYS = ("is_success", "success")
-RENDER = "render"  # instead of a path, it selects the image that the environment renders
+RENDER = "render"  # path that selects the image that the environment renders
 _PATH = re.compile(r"(?P<keys>[^\[\]]*?)(?:\[(?P<start>-?\d*):(?P<stop>-?\d*)\])?")
 
 
@@ -40,7 +41,7 @@ _PATH = re.compile(r"(?P<keys>[^\[\]]*?)(?:\[(?P<start>-?\d*):(?P<stop>-?\d*)\])
 class Defaults:
     """Defaults of the options of `Gymnasium` for one id; None selects the environment's values."""
 
-    module: str | None = None  # the module that registers the id
+    module: str | None = None  # the module that registers the id, to be imported
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     cameras: Mapping[str, str] | None = None
     instruction: str = ""
@@ -49,7 +50,7 @@ class Defaults:
 
 
 def defaults_for(task: str) -> Defaults:
-    """Return the default options for a Gymnasium id; empty if the id is not known."""
+    """Return the default options for a Gymnasium id; empty for an unknown id."""
     if task == "gym_pusht/PushT-v0":
         return _PUSHT
     fetch = re.fullmatch(r"Fetch(\w+?)(?:Dense)?-v\d+", task)
@@ -106,8 +107,8 @@ class Gymnasium(EvalEnv):
     """A Gymnasium environment with a continuous action vector, Box (D,).
 
     Actions are clipped to the Box. Success is `info["is_success"]` or `info["success"]` if the
-    environment returns one. Otherwise, and without the option `success`, no episode succeeds and
-    only the returns are meaningful.
+    environment returns one. If it returns neither and the option `success` is not set, no episode
+    succeeds, and only the returns are meaningful.
     """
 
     def __init__(
@@ -129,31 +130,34 @@ class Gymnasium(EvalEnv):
         max_steps: int | None = None,
         remake: bool = False,
     ) -> None:
-        """Make the environment, and check one observation of it.
+        """Create the environment, and check one of its observations.
 
         Args:
             task: The Gymnasium id.
             module: The module that registers the id; by default the id's namespace.
             kwargs: Arguments of `gymnasium.make`; `render_mode` is "rgb_array" by default.
-            cameras: Name -> path of an (H, W, 3) uint8 image in the observation, or "render".
-            state: Name -> path of a vector, optionally with a range: "robot/qpos[0:7]"; see `Pick`.
+            cameras: Name of the camera -> path of an (H, W, 3) uint8 image in the observation, or
+                "render".
+            state: Name of the state part -> path of a vector, optionally with a range:
+                "robot/qpos[0:7]"; see `Pick`.
             gripper: The path of a number in the observation.
-            gripper_range: The values of that number when the gripper is closed and when it is open.
+            gripper_range: The values of the gripper's number when the gripper is closed and when it
+                is open.
             success: The path of a bool in the step's info, or "terminated".
             instruction: The task in words.
             control_hz: The rate of the steps, Hz.
-            unit_actions: Whether actions are in [-1, 1], and are scaled to the Box.
+            unit_actions: Whether actions are in [-1, 1] and are scaled to the Box.
             width: The width to which every image is stretched, pixels.
             height: The height to which every image is stretched, pixels.
-            max_steps: The step limit, instead of the registered one.
-            remake: Whether each reset makes the simulator again. This is for simulators whose
-                `reset` does not reset all of their state.
+            max_steps: The step limit; default: the limit with which the id is registered.
+            remake: Whether each reset creates the simulator again, for simulators whose `reset`
+                does not reset the whole state.
 
         Raises:
-            UnknownEnv: There is no such id.
+            UnknownEnv: The id is unknown.
             ConfigError: An option does not fit the environment.
             MissingDependency: The simulator is not installed.
-            EnvFailed: The simulator cannot be made.
+            EnvFailed: The simulator cannot be created.
         """
         if task is None:
             raise UnknownEnv(
@@ -209,7 +213,7 @@ class Gymnasium(EvalEnv):
             raise
 
     def _step_limit(self, max_steps: int | None) -> int:
-        """Return `max_steps`; if it is None, return the limit with which the id was registered."""
+        """Return `max_steps` or, if it is None, the limit with which the id is registered."""
         spec = self._env.spec
         limit = max_steps or (spec.max_episode_steps if spec is not None else None)
         if limit is None or limit < 1:
@@ -231,7 +235,7 @@ class Gymnasium(EvalEnv):
         return self._instruction
 
     def describe(self) -> dict[str, Any]:
-        """Return the id, the versions, and the settings with their deviations from the protocol."""
+        """Return the id, the versions, the settings, and their deviations from the protocol."""
         settings = {"max_steps": self.max_steps, "control_hz": self._contract.control_hz}
         protocol = settings if self._protocol is None else self._protocol.describe(**settings)
         return {
@@ -259,7 +263,7 @@ class Gymnasium(EvalEnv):
         if seed < 0:
             raise ConfigError(f"{self._name}: seed: expected a number from 0, got {seed}")
         if self._env is None:
-            raise NotReset(f"{self._name}: is closed; make it again")
+            raise NotReset(f"{self._name}: is closed; create it again")
 
         if self._remake:
             self._call("close")
@@ -284,8 +288,8 @@ class Gymnasium(EvalEnv):
 
         success = self._is_success(terminated, info)
         is_truncated = bool(truncated) or self._steps >= self.max_steps
-        # Images are rendered even if they are not used: rendering changes the state of some envs,
-        # such as the target of the Fetch tasks.
+        # Render images even if they are not used, since rendering changes the state of some envs,
+        # such as the target in the Fetch tasks.
         obs = self._observe(nested)
         info = {**plain(info), "success": success}
         return obs, float(reward), bool(terminated), is_truncated, info
@@ -306,13 +310,13 @@ class Gymnasium(EvalEnv):
             env.close()
 
     def _make(self, max_steps: int | None) -> Any:
-        """Make Gymnasium's environment, and turn its errors into ours."""
-        # Pygame, the renderer of several environments, otherwise prints a greeting on import.
+        """Create Gymnasium's environment, and convert its errors to errors of this package."""
+        # Otherwise Pygame, the renderer of several environments, prints a greeting on import.
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         gymnasium = require("gymnasium")
         module = self._module
         if not module and self._id not in gymnasium.registry:
-            module = self._id.rpartition("/")[0].partition(":")[0]  # the id's namespace
+            module = self._id.rpartition("/")[0].partition(":")[0]  # the namespace of the id
         if module:
             require(module)
 
@@ -335,7 +339,7 @@ class Gymnasium(EvalEnv):
             ) from error
 
     def _call(self, method: str, *args: Any, **kwargs: Any) -> Any:
-        """Call a method of the environment, and turn its errors into `EnvFailed`."""
+        """Call a method of the environment, and convert its errors to `EnvFailed`."""
         try:
             return getattr(self._env, method)(*args, **kwargs)
         except VLAgentsError:
@@ -346,7 +350,7 @@ class Gymnasium(EvalEnv):
             ) from error
 
     def _observe(self, nested: Any) -> Obs:
-        """Convert an observation of the environment."""
+        """Convert an observation of the environment to an `Obs`."""
         cameras = {}
         for name, pick in self._cameras.items():
             image = self._call("render") if pick.text == RENDER else pick.value(nested)
@@ -376,7 +380,7 @@ class Gymnasium(EvalEnv):
 
 
 _ID = "gym_pusht/PushT-v0"
-# The observations of each task: options of `Gymnasium`.
+# Options of `Gymnasium` that select the observations of each task.
 _TASKS: dict[str, Mapping[str, Any]] = {
     "image": {},
     "keypoints": {"kwargs": {"obs_type": "environment_state_agent_pos"}, "cameras": {}},
@@ -386,13 +390,13 @@ _TASKS: dict[str, Mapping[str, Any]] = {
 class PushT(Gymnasium):
     """PushT with its published protocol, "image" or "keypoints".
 
-    Observation: `state["agent_pos"]`, (2,), in pixels of the field, which is 512 by 512. "image"
+    Observation: `state["agent_pos"]`, (2,), in pixels of the field of 512 by 512 pixels. "image"
     also has the camera "front", (96, 96, 3) by default. "keypoints" also has
     `state["environment_state"]`, (16,), x and y of eight points of the block, in pixels.
     `info["sim_state"]`, (7,) float64, is the simulator's state: x, y and velocity of the agent,
     pixels and pixels/s; x, y and angle of the block, pixels and rad.
 
-    Action: (2,) in [0, 512]: the target of the disc, in the same pixels.
+    Action: (2,) in [0, 512]: the target position of the agent, a disc, in the same pixels.
     """
 
     known = tuple(_TASKS)
@@ -405,7 +409,7 @@ class PushT(Gymnasium):
         height: int | None = None,
         max_steps: int | None = None,
     ) -> None:
-        """Make the environment; images are stretched to `width` and `height`, pixels."""
+        """Create the environment; images are stretched to `width` and `height`, pixels."""
         self.require_task(task)
         super().__init__(_ID, **_TASKS[task], width=width, height=height, max_steps=max_steps)
 
@@ -434,8 +438,8 @@ def _picks(paths: Mapping[str, str]) -> dict[str, Pick]:
 class Pick:
     """The path of a value in a nested observation, and the range of its numbers."""
 
-    text: str  # as in the options of `Gymnasium`
-    keys: tuple[str, ...]  # from the outermost to the innermost
+    text: str  # the path as written in the options of `Gymnasium`
+    keys: tuple[str, ...]  # keys, from the outermost to the innermost
     range: slice
 
     @classmethod
@@ -443,8 +447,8 @@ class Pick:
         """Parse a path.
 
         Args:
-            text: Such as `"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"` or `"[2:]"`; `""` is
-                the whole observation.
+            text: The path, such as `"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"` or `"[2:]"`;
+                `""` is the whole observation.
 
         Raises:
             ConfigError: The text is not a path.
@@ -461,7 +465,7 @@ class Pick:
         return cls(text, keys, slice(start, stop))
 
     def value(self, nested: Any) -> Any:
-        """Return the whole value under the keys; raises `ConfigError` if there is none."""
+        """Return the whole value under the keys; raises `ConfigError` if a key is missing."""
         for key in self.keys:
             if not isinstance(nested, Mapping):
                 kind = type(nested).__name__
@@ -473,7 +477,9 @@ class Pick:
         return nested
 
     def vector(self, nested: Any) -> np.ndarray:
-        """Return the range of the value, (D,) float32; raises `ConfigError` if it is no vector."""
+        """Return the selected range of the value, (D,) float32; raises `ConfigError` if the value
+        is not a vector.
+        """
         array = np.array(self.value(nested), dtype=np.float32)
         if array.ndim > 1:
             raise ConfigError(
@@ -488,7 +494,9 @@ class Pick:
         return numbers
 
     def number(self, nested: Any) -> float:
-        """Return the range of the value as a number; raises `ConfigError` if it has several."""
+        """Return the selected range of the value as a number; raises `ConfigError` if it has
+        several numbers.
+        """
         vector = self.vector(nested)
         if vector.size != 1:
             raise ConfigError(
@@ -501,12 +509,12 @@ class Pick:
 def as_image(
     value: Any, name: str, size: tuple[int | None, int | None] = (None, None)
 ) -> np.ndarray:
-    """Copy an image to an array (H, W, 3) uint8 RGB of a size.
+    """Copy an image to an array (H, W, 3) uint8 RGB, and stretch it to a size.
 
     Args:
         value: The image.
         name: The camera, for errors.
-        size: Height and width, px, to which the image is stretched; None keeps a side.
+        size: Height and width, px; None keeps the height or width.
 
     Raises:
         ConfigError: The value is not an RGB image.
@@ -525,10 +533,10 @@ def as_image(
 
 
 def plain(value: Any) -> Any:
-    """Convert a value to one that a message can contain.
+    """Convert a value to a value that can be sent in a message.
 
     Scalars of numpy become numbers of Python, tuples become lists, and keys become strings. Other
-    values (objects, functions) become None. Mappings omit items that are None.
+    values (objects, functions) become None. Items of mappings are omitted if they are None.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -546,8 +554,8 @@ def bounds(space: Any) -> tuple[np.ndarray, np.ndarray, np.dtype[Any]]:
     """Return the bounds of a Box (D,), float64, and its dtype."""
     if type(space).__name__ != "Box" or len(space.shape) != 1:
         raise ConfigError(
-            "action space: expected Box (D,), as policies return continuous vectors, got "
-            f"{space}; wrap the environment, and register the wrapped one"
+            f"action space: expected Box (D,), as policies return continuous vectors, got {space}; "
+            f"wrap the environment, and register the wrapped environment"
         )
     return space.low.astype(np.float64), space.high.astype(np.float64), space.dtype
 
@@ -560,15 +568,15 @@ def uniform(bounds: np.ndarray) -> float | None:
 def camera_and_state_paths(
     space: Any, render_mode: str | None
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """Find the images and the vectors of an observation space.
+    """Return the paths of the images and the vectors in an observation space.
 
     Args:
         space: A space of Gymnasium.
         render_mode: The render mode of the environment.
 
     Returns:
-        Camera -> path of its image, and name in the state -> path of its vector. If there is no
-        image, the environment's renderer is the camera "front".
+        Two mappings: camera -> path of its image, and state part -> path of its vector. If there is
+        no image, the environment's renderer is the camera "front".
     """
     cameras: dict[str, str] = {}
     state: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""The base class of simulator environments, MuJoCo cameras, and the protocol of a benchmark."""
+"""The base class of simulator environments, cameras for MuJoCo, and the protocols of benchmarks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Size = tuple[int, int]  # height, width in pixels
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkProtocol:
-    """The settings that published numbers of a benchmark share, and their source.
+    """The common settings of the published results of a benchmark, and their source.
 
     `describe()["protocol"]` of an environment contains them.
     """
@@ -36,7 +36,7 @@ class BenchmarkProtocol:
     control_hz: float
     control: str  # the quantity that an action commands
     success: str  # the condition under which an episode counts as solved
-    metric: Metric  # whether it must hold after any step, or after the last one
+    metric: Metric  # whether the condition must hold after any step, or after the last step
     begins: str  # the effect of an episode's seed and initial state
     ends_on_success: bool
     episodes: int | None = None  # episodes per task in published tables; None if they differ
@@ -45,11 +45,11 @@ class BenchmarkProtocol:
         """Return the protocol as plain values.
 
         Args:
-            settings: Fields of the protocol, with the values that are used.
+            settings: Fields of the protocol, with the values in use.
 
         Returns:
-            The fields of the protocol by name, and `deviations`, a sentence for each of `settings`
-            that differs.
+            The fields of the protocol by name, and `deviations`, a sentence for each setting that
+            differs from the protocol.
         """
         deviations = []
         for name, value in settings.items():
@@ -67,14 +67,14 @@ class SimulatorEnv(EvalEnv):
             act = Act(action=np.zeros(12, np.float32))
             obs, reward, terminated, truncated, info = env.step(act)
 
-    A subclass sets the class variables below, makes its simulator in the constructor within
-    `_making`, and registers its clean-up with `_resources`. `_begin` begins an episode and
-    `_advance` executes a step; both are only called while the simulator is open, and their errors
-    become `EnvFailed`.
+    A subclass sets the class variables below, creates its simulator in the constructor within the
+    context `_making`, and registers the clean-up with `_resources`. The method `_begin` begins an
+    episode, and `_advance` executes a step. Both are called only while the simulator is open, and
+    their errors are converted to `EnvFailed`.
 
     Most constructors have the following options; None selects the default of the task or the
     protocol: `width` and `height` of each image, pixels; `instruction`, the task in words;
-    `max_steps`, the step limit; `ends_on_success`, whether success ends the episode (if not,
+    `max_steps`, the step limit; `ends_on_success`, whether success ends the episode (if False,
     success at the end can also be measured).
     """
 
@@ -89,7 +89,7 @@ class SimulatorEnv(EvalEnv):
     _instruction: str = ""
     _protocol: BenchmarkProtocol | None = None
     _ends_on_success: bool = True
-    _env: Any = None  # the simulator; None before it is made and after `close`
+    _env: Any = None  # the simulator; None before it is created and after `close`
     _steps: int | None = None  # steps of the current episode; None before the first reset
 
     def __init__(self, task: str, **sizes: int | None) -> None:
@@ -97,7 +97,7 @@ class SimulatorEnv(EvalEnv):
 
         Args:
             task: The name of the task.
-            sizes: Options of the constructor, each of which must be None or at least 1.
+            sizes: Options of the constructor; each must be None or at least 1.
 
         Raises:
             UnknownEnv: The task is not known.
@@ -106,7 +106,7 @@ class SimulatorEnv(EvalEnv):
         self.require_task(task)
         self._name = f"{self.suite}/{task}"
         require_sizes(self._name, **sizes)
-        self._resources = ExitStack()  # called by `close`, last in first out
+        self._resources = ExitStack()  # clean-up, which `close` calls in reverse order
         prepare_rendering()
 
     @property
@@ -120,12 +120,12 @@ class SimulatorEnv(EvalEnv):
     @classmethod
     def require_task(cls, task: str | None) -> None:
         known = cls.tasks()
-        if task is not None and known:  # The constructor has a default.
+        if task is not None and known:  # The constructor has a default task.
             require_known(cls.suite, task, known)
 
     @classmethod
     def missing(cls) -> str | None:
-        """Return why the simulator cannot run here; None if it can.
+        """Return the reason why the simulator cannot run here; None if it can run.
 
         The first call in a process renders one frame in a child process.
         """
@@ -146,7 +146,8 @@ class SimulatorEnv(EvalEnv):
         """Begin the episode of `seed`, taken modulo 2^32.
 
         If the task has fixed initial states, the episode begins in the state
-        `options["init_state"]`, or in one that the seed selects. There are no other options.
+        `options["init_state"]`, or else in a state that the seed selects. There are no other
+        options.
         """
         self._alive()
         options = options or {}
@@ -226,7 +227,7 @@ class SimulatorEnv(EvalEnv):
             action: (D,) float32.
 
         Returns:
-            `(obs, reward, terminated, info)`, as for `EvalEnv.step`.
+            `(obs, reward, terminated, info)`, as in `EvalEnv.step`.
         """
 
     @classmethod
@@ -234,20 +235,22 @@ class SimulatorEnv(EvalEnv):
         """Raise `EnvFailed`, with the cure, if files of the simulator are missing."""
 
     def _solved(self, success: bool) -> tuple[bool, dict[str, Any]]:
-        """Return `terminated` and `info` for a step, given whether the task is solved after it."""
+        """Return `terminated` and `info` for a step, given whether the task is solved after the
+        step.
+        """
         return success and self._ends_on_success, {"success": success}
 
     def _alive(self) -> Any:
         """Return the simulator; raises `EnvFailed` after `close`."""
         if self._env is None:
-            raise EnvFailed(f"{self._name} is closed; make a new one")
+            raise EnvFailed(f"{self._name} is closed; create a new environment")
         return self._env
 
     @contextmanager
     def _making(self) -> Iterator[None]:
-        """Guard the construction of the simulator in the block.
+        """Convert errors while the simulator is created within the context.
 
-        An error becomes `EnvFailed`, and resources that were already made are freed.
+        An error is converted to `EnvFailed`, and resources that were already created are freed.
         """
         try:
             with failing(self._name, "make"):
@@ -270,16 +273,16 @@ class MujocoCameras:
         upside_down: Collection[str] = (),
         shadows: bool = True,
     ) -> None:
-        """Make the renderer, and enlarge the model's frame buffer if needed.
+        """Create the renderer, and enlarge the model's frame buffer if necessary.
 
         Args:
             env: The name of the environment, for errors.
             model: A `mujoco.MjModel`.
             cameras: The names of the cameras to render.
             size: Height and width of the images, px.
-            upside_down: The cameras whose images are rotated by 180 degrees.
-            shadows: Whether to render shadows, reflections and smooth edges. Without them, an image
-                that is rendered in software takes a tenth of the time.
+            upside_down: The cameras whose images must be rotated by 180 degrees.
+            shadows: Whether to render shadows, reflections and smooth edges. Without them,
+                rendering an image in software takes a tenth of the time.
 
         Raises:
             ConfigError: The model has no such camera.
@@ -329,20 +332,22 @@ def camera_names(model: Any) -> list[str]:
 
 
 def without(modules: Sequence[str], cure: str) -> str | None:
-    """Return the first of these modules that is not installed, with the cure; None if all are."""
+    """Return the first of these modules that is not installed, with the cure; None if all are
+    installed.
+    """
     missing = next((module for module in modules if importlib.util.find_spec(module) is None), None)
     return None if missing is None else f"{missing} is not installed; {cure}"
 
 
 @contextmanager
 def failing(env: str, doing: str) -> Iterator[None]:
-    """Turn errors of a simulator in the block into `EnvFailed`.
+    """Convert errors of a simulator within the context to `EnvFailed`.
 
-    Errors of drivers get a cure. The errors of this package are raised unchanged.
+    The message for driver errors contains a cure. Errors of this package are raised unchanged.
 
     Args:
         env: The name of the environment.
-        doing: What the simulator does in the block, as a verb.
+        doing: The action of the simulator within the context, as a verb.
     """
     try:
         yield

@@ -246,8 +246,8 @@ class _Run(Consumer):
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
         """Run all queued episodes, until a signal or the deadline ends the run.
 
-        Write the summary before the process disconnects from Ray: when Slurm cancels a job, Ray
-        stops responding immediately, and the job is killed seconds later.
+        The summary is written before the process disconnects from Ray: when Slurm cancels a job,
+        Ray stops responding immediately, and the job is killed seconds later.
 
         Returns:
             The state of the run, and its summary.

@@ -27,14 +27,14 @@ from vlagents_ray.registry import pip_install
 ON_GPU = ("gpu", "cuda", "physx_cuda")
 
 
-# The section "Evaluation" of ManiSkill 3's guide to reinforcement learning.
+# Source: the section "Evaluation" of ManiSkill 3's guide to reinforcement learning.
 PROTOCOL = {
     "ignore_terminations": True,  # an episode continues to the step limit after success or failure
-    # The scene is rebuilt for each episode, with other objects if the task draws them.
+    # The scene is rebuilt for each episode, with other objects if the task samples its objects.
     "reconfiguration_freq": 1,
     "metrics": ["success_once", "success_at_end"],
-    "metric": "success_once",  # the metric that ManiSkill's baselines compare
-    # Each episode has a seed, which determines all its random draws.
+    "metric": "success_once",  # the metric with which ManiSkill's baselines are compared
+    # Each episode has a seed, which determines all random draws in the episode.
     "seeds": "one an environment",
 }
 
@@ -44,22 +44,22 @@ class ManiSkill(SimulatorEnv):
 
     Observation: the task's cameras. `state` contains the arm's `joints` (without the fingers), and
     `tquat` and `xyzrpy`, the pose of the tool centre point in the robot's base frame. `gripper` is
-    its opening. `info["sim_state"]`, (D,) float32, is for scripted experts only: ManiSkill's flat
-    state observation, which includes the positions of objects. Some goals, such as PickCube's, are
-    hidden from cameras.
+    its opening. `info["sim_state"]`, (D,) float32, is ManiSkill's flat state observation, which
+    includes the positions of objects; only scripted experts should use it. Cameras do not show some
+    goals, such as the goal of PickCube.
 
     Action, in the default control mode `pd_ee_delta_pose`: (7,) in [-1, 1], or (6,) for a robot
     without a gripper.
 
-    - The first three values move the tool by 0.1 m per unit along the base's axes.
-    - The next three turn it about the base's axes by **minus** 0.1 rad per unit, since ManiSkill
-      scales them by their lower bound.
-    - The last value is the gripper, 1 open, -1 closed.
+    - The first three values move the tool along the base's axes, by 0.1 m per unit.
+    - The next three values rotate the tool about the base's axes, by **minus** 0.1 rad per unit,
+      since ManiSkill scales them by their lower bound.
+    - The last value is the gripper: 1 is open, -1 is closed.
 
     The arm lags behind its commands: a constant 1.0 moves it by about 0.03 m per step.
 
-    The env continues after success, so that success once and success at the end can both be
-    measured. It never reports `terminated`.
+    The env continues after success, so that both success once and success at the end can be
+    measured. The env never reports `terminated`.
     """
 
     suite, known = "maniskill", tuple(INSTRUCTIONS)
@@ -80,21 +80,22 @@ class ManiSkill(SimulatorEnv):
         reward_mode: str | None = None,
         reconfigure: bool = True,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are described in
-        `SimulatorEnv`.
+        """Create the environment; raises the errors of `make_env`. The other options are described
+        in `SimulatorEnv`.
 
         Args:
             task: ManiSkill's id of the task.
             cameras: The cameras of the task to return; None selects all of them.
             control_mode: ManiSkill's name; None selects `pd_ee_delta_pose`, or the robot's default
                 if the robot lacks that mode.
-            instruction: None selects the instruction of the task, see `instruction_for`.
+            instruction: The task in words; None selects the instruction of the task, see
+                `instruction_for`.
             sim_backend: "physx_cpu", which is faster for a single environment, or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name, e.g. "minimal", "default"; None selects the task's shader.
             reward_mode: ManiSkill's name; None selects the task's mode.
-            reconfigure: Whether to rebuild the scene for each episode. Without that, a reset takes
-                about 15 ms less, but the dynamics of some tasks (PlugCharger, PushT) depend on the
+            reconfigure: Whether to rebuild the scene for each episode. If False, a reset is about
+                15 ms faster, but the dynamics of some tasks (PlugCharger, PushT) depend on the
                 previous episode.
         """
         super().__init__(task)
@@ -117,7 +118,7 @@ class ManiSkill(SimulatorEnv):
 
     @property
     def instruction(self) -> str:
-        """The instruction of the constructor, or the task's."""
+        """The instruction passed to the constructor, or else the task's instruction."""
         if self._chosen_instruction is not None:
             return self._chosen_instruction
         instructions: list[str] = self._alive().instructions()
@@ -138,13 +139,13 @@ class ManiSkill(SimulatorEnv):
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
-        """Do nothing, since only ManiSkill knows the registered ids."""
+        """Accept every name, since only ManiSkill knows the registered ids."""
 
     @classmethod
     def missing(cls) -> str | None:
-        """Return why ManiSkill cannot run here, with the cure; None if it can.
+        """Return the reason why ManiSkill cannot run here, with the cure; None if it can run.
 
-        The first call in a process renders one frame in a child.
+        The first call in a process renders one frame in a child process.
         """
         modules = ("mani_skill", "sapien", "gymnasium", "torch")
         missing = without(modules, pip_install("maniskill"))
@@ -158,7 +159,7 @@ class ManiSkill(SimulatorEnv):
 
     @classmethod
     def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:
-        """Make all environments in one simulator, if it runs on a GPU."""
+        """Create all environments in one simulator, if the simulator runs on a GPU."""
         if options.get("sim_backend") not in ON_GPU:
             return None
         return ManiSkillBatch(num_envs=num_envs, **options)
@@ -183,9 +184,9 @@ class ManiSkill(SimulatorEnv):
 
 
 class ManiSkillBatch(BatchEnv):
-    """Environments of one ManiSkill task in one simulator.
+    """Several environments of one ManiSkill task in one simulator.
 
-    Observations and actions are those of `ManiSkill`. Physics on the GPU and on the CPU are not
+    Observations and actions are as in `ManiSkill`. Physics on the GPU and on the CPU are not
     bit-identical: do not mix their results.
     """
 
@@ -200,15 +201,15 @@ class ManiSkillBatch(BatchEnv):
         reconfigure: bool = True,
         **options: Any,
     ) -> None:
-        """Make the environments; raises the errors of `ManiSkill`.
+        """Create the environments; raises the errors of `ManiSkill`.
 
         Args:
             task: ManiSkill's id of the task.
             num_envs: The number of environments.
-            instruction: As for `ManiSkill`.
-            max_steps: As for `ManiSkill`.
+            instruction: As in `ManiSkill`.
+            max_steps: As in `ManiSkill`.
             sim_backend: "physx_cuda", or "physx_cpu", which simulates a single environment.
-            reconfigure: As for `ManiSkill`.
+            reconfigure: As in `ManiSkill`.
             options: Further options of `ManiSkill`.
         """
         if sim_backend not in ON_GPU and num_envs > 1:
@@ -229,7 +230,7 @@ class ManiSkillBatch(BatchEnv):
 
     @property
     def instructions(self) -> list[str]:
-        """The instruction of the constructor, or the instructions of the tasks."""
+        """The instruction passed to the constructor, or else the tasks' instructions."""
         if self._instruction is not None:
             return [self._instruction] * self._playing
         return self._simulator.instructions()[: self._playing]
@@ -260,7 +261,7 @@ class ManiSkillBatch(BatchEnv):
         return self._simulator.reset_each(all_seeds, all_options).obs[: self._playing]
 
     def step(self, acts: Sequence[Act | None]) -> Steps:
-        """Execute an action in each episode, by one step of the simulator."""
+        """Execute an action in each episode, with one step of the simulator."""
         if not self._playing:
             raise NotReset(
                 f"maniskill/{self._task}: step was called before reset; call reset(seeds=...) first"
@@ -292,7 +293,7 @@ class ManiSkillBatch(BatchEnv):
 def _simulator(
     task: str, *, width: int = 224, height: int = 224, shader: str | None = None, **options: Any
 ) -> Simulator:
-    """Make the simulator of a task, with images of a size, px."""
+    """Create the simulator of a task, with images of `size`, px."""
     name = f"maniskill/{task}"
     require_sizes(name, width=width, height=height)
     sensors: dict[str, Any] = {"width": width, "height": height}
@@ -304,10 +305,10 @@ def _simulator(
 def _described(
     simulator: Simulator, reconfigure: bool, max_steps: int, task_limit: int | None
 ) -> dict[str, Any]:
-    """Return the facts of `describe`, with the deviations from the protocol."""
+    """Return the description for `describe`, with the deviations from the protocol."""
     deviations = []
     if not reconfigure:
-        deviations.append("reconfigure is False: scenes are kept from episode to episode")
+        deviations.append("reconfigure is False: scenes are reused in later episodes")
     if max_steps != task_limit:
         deviations.append(f"max_steps is {max_steps}, the task's limit is {task_limit}")
     return simulator.describe() | {

@@ -31,7 +31,7 @@ from vlagents_ray.registry import require
 
 DEFAULT_CONTROL_MODE = "pd_ee_delta_pose"
 
-# The tasks whose assets are in the package.
+# Instructions of the tasks whose assets are in ManiSkill's package.
 INSTRUCTIONS: dict[str, str] = {
     "LiftPegUpright-v1": "lift the peg and stand it upright on the table",
     "PegInsertionSide-v1": "pick up the peg and insert its orange end into the hole in the box",
@@ -70,8 +70,8 @@ def step_limits(env: str, task: str, max_steps: int | None) -> tuple[int, int | 
         The limit to use, and the limit of the task, if it has one.
 
     Raises:
-        UnknownEnv: There is no such task.
-        ConfigError: There is no limit, or it is below 1.
+        UnknownEnv: The task is unknown.
+        ConfigError: There is no limit, or the limit is below 1.
     """
     prepare_rendering()
     require("sapien")
@@ -87,7 +87,7 @@ def step_limits(env: str, task: str, max_steps: int | None) -> tuple[int, int | 
     task_limit: int | None = registered[task].max_episode_steps
     limit = task_limit if max_steps is None else max_steps
     if limit is None:
-        raise ConfigError(f"{env} has no step limit of its own; set max_steps")
+        raise ConfigError(f"{env} has no step limit; set max_steps")
     require_sizes(env, max_steps=limit)
     return limit, task_limit
 
@@ -102,7 +102,7 @@ def chosen_backend(render_backend: str) -> str:
         return render_backend
     try:
         require("sapien").Device("cuda")
-    except RuntimeError:  # raised by SAPIEN if there is no device
+    except RuntimeError:  # SAPIEN raises this if there is no device
         return "cpu"
     return "gpu" if require("torch").cuda.is_available() else "cpu"
 
@@ -110,7 +110,7 @@ def chosen_backend(render_backend: str) -> str:
 def make_bare(
     task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any
 ) -> Any:
-    """Make the bare environment, without Gymnasium's wrappers.
+    """Create the bare environment, without Gymnasium's wrappers.
 
     Args:
         task: ManiSkill's id.
@@ -122,13 +122,13 @@ def make_bare(
 
     Raises:
         ConfigError: The robot lacks the control mode.
-        EnvFailed: The environment cannot be made for another reason.
+        EnvFailed: The environment cannot be created for another reason.
     """
     arguments = {name: value for name, value in options.items() if value is not None}
     arguments |= {"sim_backend": sim_backend, "render_backend": render_backend}
     gymnasium = require("gymnasium")
     with _no_prompts(task), failing(f"maniskill/{task}", "make"), warnings.catch_warnings():
-        # Making the digital twin of the cubes causes this warning, for a list of 24 arrays.
+        # Creating the digital twin of the cubes causes this warning, for a list of 24 arrays.
         warnings.filterwarnings("ignore", "Creating a tensor from a list of numpy", UserWarning)
         _keep_renderer(sim_backend, render_backend)
 
@@ -145,9 +145,9 @@ def make_bare(
 
 @contextlib.contextmanager
 def _no_prompts(task: str) -> Iterator[None]:
-    """Turn ManiSkill's prompt in the block into `EnvFailed`.
+    """Convert ManiSkill's prompts within the context to `EnvFailed`.
 
-    If assets are missing, ManiSkill offers on stdin to download them.
+    If assets are missing, ManiSkill prompts on stdin for their download.
     """
     output = io.StringIO()
     stdin, sys.stdin = sys.stdin, io.StringIO("n\n")
@@ -169,12 +169,12 @@ def _no_prompts(task: str) -> Iterator[None]:
 
 @functools.cache
 def _prepare_process() -> None:
-    """Make reconfigurations cheap, and suppress repeated warnings; once per process."""
-    # ManiSkill collects garbage at each reconfiguration, which takes 150 ms. Most of that time is
-    # spent on imported modules, which are not garbage.
+    """Make reconfigurations fast, and suppress repeated warnings; done once per process."""
+    # ManiSkill collects garbage at each reconfiguration, which takes 150 ms. Most of this time is
+    # spent on imported modules, which are not garbage, so exclude them.
     gc.collect()
     gc.freeze()
-    # Tasks and robots repeat these warnings at each reconfiguration, and no user can act on them.
+    # Tasks and robots repeat these warnings at each reconfiguration, and users cannot avoid them.
     # The logger's name ends with a space.
     repeated = ("No initial pose set for ", "Mimic targets dictionary is missing")
     logging.getLogger("mani_skill ").addFilter(
@@ -184,10 +184,10 @@ def _prepare_process() -> None:
 
 @functools.cache
 def _keep_renderer(sim_backend: str, render_backend: str) -> object:
-    """Keep a renderer for the life of the process.
+    """Keep a renderer for the lifetime of the process.
 
-    SAPIEN frees its device and its compiled shaders with the last scene that uses them. Making the
-    next environment would then take 5 s instead of 0.1 s.
+    Otherwise SAPIEN frees its device and its compiled shaders with the last scene that uses them,
+    and creating the next environment takes 5 s instead of 0.1 s.
     """
     import sapien.render
 
@@ -197,19 +197,20 @@ def _keep_renderer(sim_backend: str, render_backend: str) -> object:
 
 
 # ManiSkill's name of a robot -> position of a finger's joint when closed and when open, m. In an
-# action for these robots, the last value is the gripper, -1 closed, 1 open. Other robots have no
-# gripper in the contract.
+# action for these robots, the last value is the gripper: -1 is closed, 1 is open. Other robots have
+# no gripper in the contract.
 _FINGER_M = {
     "panda": (0.0, 0.04),
     "panda_wristcam": (0.0, 0.04),
     "widowx250s_bridgedataset_flat_table": (0.015, 0.037),
     "widowx250s_bridgedataset_sink": (0.015, 0.037),
 }
-# The link whose pose is the tool's, if ManiSkill names no tool centre point.
+# Robot -> the link whose pose is the tool's pose, if ManiSkill names no tool centre point.
 _TOOL_LINK = "ee_gripper_link"
 
-# Control mode -> the values of an action that move the arm, from mani_skill/agents/controllers. The
-# rotation of "pd_ee_*pose" is intrinsic XYZ Euler in the base frame; see `ManiSkill` for its sign.
+# Control mode -> description of the action's values that move the arm, from
+# mani_skill/agents/controllers. The rotation of "pd_ee_*pose" is intrinsic XYZ Euler in the base
+# frame; see `ManiSkill` for its sign.
 _EE_POSE = {"space": "ee_pose", "rotation": "euler_xyz", "frame": "base"}
 _EE_POSITION = {"space": "ee_position", "rotation": "none", "frame": "base"}
 _JOINT: dict[str, Any] = {"space": "joint", "rotation": "none"}
@@ -227,7 +228,7 @@ CONTROL_MODES: dict[str, dict[str, Any]] = {
 
 
 class ManiSkillRobot:
-    """Reads proprioception from ManiSkill's `agent`, which each reconfiguration replaces."""
+    """Reads the proprioception from ManiSkill's `agent`, which each reconfiguration replaces."""
 
     def __init__(self, agent: Any) -> None:
         """Read the names of the joints of an `agent` of ManiSkill."""
@@ -250,8 +251,8 @@ class ManiSkillRobot:
             agent: The current `agent`.
 
         Returns:
-            For each environment, the state, whose values are (D,) float32, and the gripper in
-            [0, 1], 1 = open, or None without a gripper.
+            For each environment, the state, whose values are (D,) float32, and the gripper in [0,
+            1], 1 = open, or None if there is no gripper.
         """
         rows = agent.robot.get_qpos().cpu().numpy()
         states = [{"joints": qpos[self._arm]} for qpos in rows]
@@ -274,7 +275,7 @@ class ManiSkillRobot:
 
 
 def _tool(agent: Any) -> Any:
-    """Return the link whose pose is the tool's; None if there is none."""
+    """Return the link whose pose is the tool's pose; None if there is no such link."""
     tcp = getattr(agent, "tcp", None)
     return agent.robot.links_map.get(_TOOL_LINK) if tcp is None else tcp
 
@@ -315,7 +316,7 @@ def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.nda
     bw, bx, by, bz = base[3:].astype(float).tolist()
     tw, tx, ty, tz = tool[3:].astype(float).tolist()
 
-    # The rotation: conj(base) * tool.
+    # The rotation is conj(base) * tool.
     w = bw * tw + bx * tx + by * ty + bz * tz
     x = bw * tx - bx * tw - by * tz + bz * ty
     y = bw * ty + bx * tz - by * tw - bz * tx
@@ -323,7 +324,7 @@ def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.nda
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
 
-    # The offset p, rotated by conj(base): p + 2 b x (b x p - bw p), where b = (bx, by, bz).
+    # The offset p, rotated by conj(base), is p + 2 b x (b x p - bw p), where b = (bx, by, bz).
     px, py, pz = (tool[:3] - base[:3]).astype(float).tolist()
     cx = by * pz - bz * py - bw * px
     cy = bz * px - bx * pz - bw * py
@@ -332,7 +333,7 @@ def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.nda
     py += 2 * (bz * cx - bx * cz)
     pz += 2 * (bx * cy - by * cx)
 
-    # Sine and cosine of the roll, both multiplied by the cosine of the pitch.
+    # Sine and cosine of the roll, each multiplied by the cosine of the pitch.
     roll_sine, roll_cosine = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)
     pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
     if math.hypot(roll_sine, roll_cosine) < _LOCKED:
@@ -357,7 +358,7 @@ class Moment:
 
 
 class Simulator:
-    """The environments of one ManiSkill task, each of which continues after success."""
+    """The environments of one ManiSkill task; they continue after success."""
 
     def __init__(
         self,
@@ -373,23 +374,23 @@ class Simulator:
         reward_mode: str | None = None,
         sensors: Mapping[str, Any],
     ) -> None:
-        """Make the simulator.
+        """Create the simulator.
 
         Args:
             name: The env's name, for errors.
             task: ManiSkill's id.
             obs_mode: ManiSkill's name.
             num_envs: The number of environments.
-            cameras: The cameras of the task to render; None selects all.
+            cameras: The cameras of the task to render; None selects all cameras.
             sim_backend: ManiSkill's name.
             render_backend: "cpu", "gpu", or "auto".
-            control_mode: As for `make_bare`.
+            control_mode: As in `make_bare`.
             reward_mode: ManiSkill's name; None selects the task's mode.
             sensors: ManiSkill's options of the cameras.
 
         Raises:
             ConfigError: The task has no success or not exactly one robot, or a name is unknown.
-            EnvFailed: The simulator cannot be made; the message has the cure.
+            EnvFailed: The simulator cannot be created; the message contains the cure.
         """
         self.name, self._task = name, task
         self._asked_for = render_backend != "auto"
@@ -404,14 +405,14 @@ class Simulator:
             sensor_configs=dict(sensors),
         )
         try:
-            if not hasattr(self.env.agent, "robot"):  # The task has no robot, or several.
+            if not hasattr(self.env.agent, "robot"):  # The task has no robot or several robots.
                 raise ConfigError(
-                    f"{self.name}: expected a task with exactly one robot; choose another"
+                    f"{self.name}: expected a task with exactly one robot; choose another task"
                 )
             if "success" not in self.env.get_info():
                 raise ConfigError(
-                    f"{self.name}: expected a task that reports success, got one without; choose "
-                    "another"
+                    f"{self.name}: expected a task that reports success, got a task without "
+                    f"success; choose another task"
                 )
 
             sizes = {}
@@ -434,7 +435,7 @@ class Simulator:
         """Return the contract.
 
         Args:
-            action: The description of actions; None selects that of the control mode.
+            action: The description of actions; None selects the description for the control mode.
         """
         env, has_gripper = self.alive(), self._robot.has_gripper
         if action is None:
@@ -449,7 +450,9 @@ class Simulator:
         )
 
     def instructions(self) -> list[str]:
-        """Return the instruction of each environment: ManiSkill's, or ours for the task."""
+        """Return the instruction of each environment: ManiSkill's instruction, or else this
+        package's instruction for the task.
+        """
         env = self.alive()
         get_instructions = getattr(env, "get_language_instruction", None)
         if get_instructions is None:
@@ -471,11 +474,12 @@ class Simulator:
         """Begin the episode of each environment separately, in the existing scenes.
 
         ManiSkill seeds torch once for all environments that it resets together, with the seed of
-        the first. Draws of a task by torch would then depend on the other environments.
+        the first environment. The random draws that a task makes with torch would then depend on
+        the other environments.
         """
         env = self.alive()
         with failing(self.name, "reset"):
-            with self._observing("none"):  # Nothing is rendered before all episodes have begun.
+            with self._observing("none"):  # Do not render before all episodes have begun.
                 for i, (seed, env_options) in enumerate(zip(seeds, options, strict=True)):
                     index = require("torch").tensor([i], device=env.device)
                     env.reset(
@@ -498,7 +502,8 @@ class Simulator:
         env = self.alive()
         observing = contextlib.nullcontext() if look else self._observing("state_dict")
         with failing(self.name, "step"), observing:
-            # A copy, since torch shares the memory, and warns about read-only arrays like Ray's.
+            # Copy the actions, since torch shares their memory, and warns about read-only arrays
+            # like Ray's.
             raw, rewards, _, _, info = env.step(actions.copy())
             moment = self.moment(raw, info)
             return replace(moment, rewards=rewards.cpu().numpy().astype(float).tolist())
@@ -525,7 +530,7 @@ class Simulator:
         return Moment(observations, success, [0.0] * len(observations))
 
     def renderer(self) -> Renderer | None:
-        """Return the device on which SAPIEN renders; None if there is none."""
+        """Return the device on which SAPIEN renders; None if it does not render."""
         device = vulkan_device(on_gpu=self.alive().backend.render_device.is_cuda())
         if device is None:
             return None
@@ -558,7 +563,7 @@ class Simulator:
     def alive(self) -> Any:
         """Return ManiSkill's environment; raises `EnvFailed` after `close`."""
         if self.env is None:
-            raise EnvFailed(f"{self.name} is closed; make a new one")
+            raise EnvFailed(f"{self.name} is closed; create a new environment")
         return self.env
 
     def close(self) -> None:
@@ -569,7 +574,7 @@ class Simulator:
 
     @contextlib.contextmanager
     def _observing(self, mode: str) -> Iterator[None]:
-        """Switch the observation mode in the block.
+        """Switch the observation mode within the context.
 
         Tasks still choose their additions to the state by the original mode.
         """

@@ -40,7 +40,7 @@ from vlagents_ray.interface import Act, Obs
 MIXED = "mixed"
 _RENDERERS = {"front": TabletopRenderer, "wrist": WristRenderer}
 _TASKS: tuple[Task, ...] = get_args(Task)
-_DISTURBED = 0.1  # share of the steps to which `disturbance` applies
+_DISTURBED = 0.1  # share of the steps with `disturbance`
 # Version of the scenes and the physics; results of different versions are not comparable.
 _VERSION = 1
 _POINTING_DOWN = (math.pi, 0.0, 0.0)  # constant roll, pitch and yaw of the gripper, rad
@@ -49,8 +49,8 @@ _POINTING_DOWN = (math.pi, 0.0, 0.0)  # constant roll, pitch and yaw of the grip
 class Tabletop(EvalEnv):
     """Four pucks, three pads and an instruction, e.g. "put the red puck on the blue pad".
 
-    Tasks: `pick_place`, `slide` (never lift the puck), `stack`, `lift`, and `mixed`, the default,
-    which draws one of the others for each episode.
+    Tasks: `pick_place`, `slide` (without lifting the puck), `stack`, `lift`, and `mixed`, the
+    default, which draws one of the other tasks for each episode.
 
     Observation: the cameras "front" and "wrist", by default only "front", (height, width, 3).
     `state["xyzrpy"]` (6,) is the position of the fingertips, m, and the constant orientation of the
@@ -60,8 +60,8 @@ class Tabletop(EvalEnv):
     in the base frame.
 
     Action: (4,). `dx, dy, dz` in units of 0.03 m per step along the base frame's axes, and the
-    gripper, 1 = open, -1 = closed. Values outside of [-1, 1] are clipped, as by a robot's
-    controller.
+    gripper, 1 = open, -1 = closed. Values outside [-1, 1] are clipped, as a robot's controller
+    does.
 
     The reward is 1.0 in each step after which the task is solved, and otherwise 0.0. An episode is
     never terminated.
@@ -81,24 +81,24 @@ class Tabletop(EvalEnv):
         object_state: bool = False,
         disturbance: float = 0.0,
     ) -> None:
-        """Make the environment of a task.
+        """Create the environment of a task.
 
         Args:
             task: One of `tasks()`; None selects `mixed`.
             width: The width of the image, at least 32 pixels.
             height: The height of the image, at least 32 pixels.
-            cameras: Some of "front" and "wrist".
+            cameras: "front", "wrist" or both.
             max_steps: The number of steps until truncation.
             pucks: The number of pucks on the table, 1 to 4. A policy without instructions can
-                identify its puck only if there is one.
-            object_state: Whether the state contains the positions of the instruction's puck and of
-                its target.
-            disturbance: Standard deviation of the noise that is added to the motion in one step of
-                ten, in units of an action. Demonstrations with such noise show how to recover from
-                errors (DART, arXiv 1703.09327).
+                identify the right puck only if there is a single puck.
+            object_state: Whether the state contains the positions of the puck and of the target in
+                the instruction.
+            disturbance: Standard deviation of the noise that is added to the motion in a tenth of
+                the steps, in units of an action. Demonstrations with such noise show how to recover
+                from errors (DART, arXiv 1703.09327).
 
         Raises:
-            ConfigError: There is no such task, or a number is out of its range.
+            ConfigError: The task is unknown, or a number is out of range.
         """
         self.require_task(task)
         self._task = task or MIXED
@@ -118,7 +118,7 @@ class Tabletop(EvalEnv):
         )
         self._renderers = {name: _RENDERERS[name](width, height) for name in cameras}
 
-        # The state of the episode.
+        # Variables of the current episode.
         self._draws = np.random.default_rng()
         self._world: TabletopWorld | None = None
         self._goal: Goal | None = None
@@ -127,7 +127,9 @@ class Tabletop(EvalEnv):
     def _require_in_range(
         self, option: str, value: float, low: int, high: int | None = None
     ) -> None:
-        """Raise `ConfigError` unless an option is between `low` and `high`, if that is not None."""
+        """Raise `ConfigError` if an option is below `low`, or above `high` if `high` is not
+        None.
+        """
         if value >= low and (high is None or value <= high):
             return
         allowed = f"at least {low}" if high is None else f"{low} to {high} in {self._task!r}"
@@ -185,7 +187,8 @@ class Tabletop(EvalEnv):
     def reset(
         self, *, seed: int, options: Mapping[str, Any] | None = None
     ) -> tuple[Obs, dict[str, Any]]:
-        """Begin an episode. The only option, `instruction`, sets another goal in the same scene.
+        """Begin an episode. The only option is `instruction`, which selects another goal in the
+        same scene.
 
         `info["instructions"]` lists the instructions of the episode's task that are possible in
         this scene.
@@ -244,7 +247,7 @@ class Tabletop(EvalEnv):
         return Obs(cameras=cameras, gripper=world.opening, state=state)
 
     def _chosen(self, world: TabletopWorld, instruction: object) -> Goal:
-        """Return the goal of an instruction; raises `ConfigError` if the scene has none."""
+        """Return the goal of an instruction; raises `ConfigError` if the scene has no such goal."""
         possible: dict[str, Goal] = {}
         for task in self._tasks:
             possible |= {goal.instruction: goal for goal in goals(world, task)}

@@ -1,7 +1,7 @@
 """Renderers of the table for the cameras "front" and "wrist".
 
-Objects at rest are drawn once. A step copies that image, and adds the gripper, the held object and
-their shadows. The geometry of the camera is in the docstring of the package.
+Objects at rest are drawn once. For each step, the renderer copies this image and adds the gripper,
+the held object and their shadows. The geometry of the camera is in the docstring of the package.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vlagents_ray.envs.tabletop.world import (
     TabletopWorld,
 )
 
-VIEW = 0.66  # m, along the image's shorter side
+VIEW = 0.66  # m, length of the table plane that the image's shorter side shows
 ELEVATION = math.radians(70)
 
 PALETTE: dict[str, Colour] = {
@@ -32,7 +32,7 @@ PALETTE: dict[str, Colour] = {
     "yellow": (244, 196, 32),
     "purple": (128, 48, 190),
 }
-# The colours of objects that no instruction names, which are nearly grey.
+# Nearly grey colours, for all objects that do not occur in instructions.
 _FLOOR, _TABLE, _TABLE_EDGE = (58, 59, 62), (227, 225, 221), (168, 165, 160)
 _FINGER, _PALM, _PALM_FRONT, _WRIST = (150, 152, 156), (86, 88, 92), (62, 63, 66), (118, 120, 124)
 _TABLE_HALF = (0.315, 0.255)  # m
@@ -45,14 +45,14 @@ _SHADOW = (0.35, -0.22)  # m/m, offset of a shadow along x and y for each metre 
 class TabletopRenderer:
     """A renderer of the camera "front", for images of one size.
 
-    It keeps the image of the objects at rest in the current episode.
+    It stores the image of the objects at rest in the current episode.
     """
 
     def __init__(self, width: int, height: int) -> None:
         """Draw the sprites of all objects, for images of this size, px."""
         self._centre = (width / 2, height / 2)
         self._scale = min(width, height) / VIEW  # px/m
-        # Factors that project lengths along y and along z onto the image's vertical axis.
+        # Factors that project lengths along y and z onto the image's vertical axis.
         self._y_factor, self._z_factor = math.sin(ELEVATION), math.cos(ELEVATION)
 
         self._background = self._draw_background(width, height)
@@ -60,11 +60,11 @@ class TabletopRenderer:
         self._pucks = {name: self._draw_puck(colour) for name, colour in PALETTE.items()}
         self._puck_shadow = self._draw_shadow(PUCK_RADIUS * 1.25, PUCK_RADIUS * 1.25, 0.42)
         self._gripper_shadow = self._draw_shadow(0.06, 0.03, 0.3)
-        self._grippers: dict[int, Sprite] = {}  # gap, px -> gripper
+        self._grippers: dict[int, Sprite] = {}  # sprites of the gripper by gap, px
 
-        # The background and the pads of the episode.
+        # Image of the background and the pads of the episode.
         self._floor_picture = self._background
-        # The floor and the pucks at rest, with their positions.
+        # Image of the background, the pads and the pucks at rest, with the pucks' positions.
         self._still = self._background
         self._still_key: tuple[tuple[float, float, float], ...] = ()
 
@@ -102,13 +102,13 @@ class TabletopRenderer:
         self._blend(image, self._pucks[puck.colour], puck.x, puck.y, puck.z)
 
     def _pixel(self, x: float, y: float, z: float) -> tuple[int, int]:
-        """Return the column and the row of a point of the base frame."""
+        """Return the column and the row of a point in the base frame."""
         column = self._centre[0] + self._scale * x
         row = self._centre[1] - self._scale * (y * self._y_factor + z * self._z_factor)
         return round(column), round(row)
 
     def _blend(self, image: np.ndarray, sprite: Sprite, x: float, y: float, z: float) -> None:
-        """Draw a sprite at a point of the base frame."""
+        """Draw a sprite at a point in the base frame."""
         sprite.blend(image, *self._pixel(x, y, z))
 
     def _shade(self, image: np.ndarray, shadow: Sprite, x: float, y: float, height: float) -> None:
@@ -132,7 +132,7 @@ class TabletopRenderer:
         drop = _TABLE_THICKNESS * scale * self._z_factor
         canvas.paint(_TABLE_EDGE, canvas.box(centre_u, centre_v + drop, half_u, half_v, corner))
 
-        # The table, which is lighter near the light, and has a grain.
+        # The table is brighter near the light, and has a grain.
         distance = np.hypot(
             (canvas.u - centre_u) / half_u + 0.5, (canvas.v - centre_v) / half_v + 0.6
         )
@@ -141,7 +141,7 @@ class TabletopRenderer:
         table_colours = np.asarray(_TABLE) * (light + grain)[..., None]
         canvas.paint(table_colours, canvas.box(centre_u, centre_v, half_u, half_v, corner))
 
-        # A line around the reach of the fingertips.
+        # A line marks the reach of the fingertips.
         reach_u, reach_v = REACH[0][1] * scale, REACH[1][1] * scale * self._y_factor
         outer = canvas.box(centre_u, centre_v, reach_u, reach_v, 0.015 * scale)
         inner = canvas.box(centre_u, centre_v, reach_u - 1, reach_v - 1, 0.015 * scale)
@@ -167,7 +167,7 @@ class TabletopRenderer:
         return canvas.sprite()
 
     def _draw_puck(self, colour: Colour) -> Sprite:
-        """Draw a cylinder, which is anchored at the centre of its underside."""
+        """Draw a cylinder, whose anchor is the centre of its underside."""
         radius_u = PUCK_RADIUS * self._scale
         radius_v = radius_u * self._y_factor
         height = PUCK_HEIGHT * self._scale * self._z_factor
@@ -177,7 +177,7 @@ class TabletopRenderer:
         bottom = canvas.ellipse(0, 0, radius_u, radius_v)
         top = canvas.ellipse(0, -height, radius_u, radius_v)
         side = canvas.box(0, -height / 2, radius_u, height / 2)
-        light = 0.72 - 0.28 * canvas.u / radius_u  # from the left
+        light = 0.72 - 0.28 * canvas.u / radius_u  # light from the left
         side_colours = base * np.clip(light, 0.4, 1.0)[..., None]
         canvas.paint(side_colours, np.maximum.reduce([bottom, top, side]))
 
@@ -190,7 +190,7 @@ class TabletopRenderer:
         return canvas.sprite()
 
     def _draw_shadow(self, half_x: float, half_y: float, darkness: float) -> Sprite:
-        """Draw an ellipse with these half axes, m, which fades towards its edge."""
+        """Draw an ellipse with these semi-axes, m, which fades towards its edge."""
         half_u, half_v = half_x * self._scale, half_y * self._scale * self._y_factor
         canvas = Canvas(half_u, half_u, half_v, half_v)
         canvas.paint((20, 20, 24), darkness * canvas.glow(0, 0, half_u, half_v))
@@ -211,7 +211,7 @@ class TabletopRenderer:
         up = length + palm_height + 2 * palm_depth + 0.03 * scale
         canvas = Canvas(width, width, up, finger)
 
-        # Each finger is a dark bar with a lighter, narrower one on its left.
+        # Each finger is a dark bar with a lighter, narrower bar on its left.
         for sign in (-1.0, 1.0):
             finger_u = sign * (gap + finger)
             dark = canvas.box(finger_u, -length / 2, finger, length / 2 + finger / 2, finger / 2)
@@ -221,7 +221,8 @@ class TabletopRenderer:
             )
             canvas.paint(_FINGER, bright)
 
-        # The palm: its front, its upper side, and the shadow of the wrist on that.
+        # The palm consists of its front, its upper side, and the shadow of the wrist on the upper
+        # side.
         palm_half_v = palm_depth * self._y_factor
         corner = 0.008 * scale
         front = canvas.box(
@@ -231,7 +232,7 @@ class TabletopRenderer:
         canvas.paint(_PALM, canvas.box(0, palm_v, palm_half, palm_half_v, corner))
         canvas.paint((48, 49, 51), 0.6 * canvas.glow(0, palm_v, 0.03 * scale, 0.024 * scale))
 
-        # The wrist: a cylinder with a lighter disc on its upper side.
+        # The wrist is a cylinder with a lighter disc on its upper side.
         radius_u = 0.02 * scale
         radius_v = radius_u * self._y_factor
         rise = 0.02 * scale * self._z_factor
@@ -264,7 +265,7 @@ class WristRenderer(TabletopRenderer):
         return section
 
 
-FloatArray = np.ndarray  # (h, w) float32 throughout, in pixels or as a coverage in [0, 1]
+FloatArray = np.ndarray  # (h, w) float32: coordinates in pixels, or a coverage in [0, 1]
 Colour = tuple[float, float, float]  # RGB, 0 to 255
 
 
@@ -278,7 +279,7 @@ class Sprite:
     top: int  # px, row of the first pixel from the anchor
 
     def blend(self, image: np.ndarray, u: int, v: int) -> None:
-        """Draw the sprite into an image; parts outside of the image are clipped.
+        """Draw the sprite into an image; parts outside the image are clipped.
 
         Args:
             image: (H, W, 3) uint8, which is changed.
@@ -302,10 +303,10 @@ class Sprite:
 
 
 class Canvas:
-    """Paints layers over each other; `u` and `v` are pixel centres relative to the anchor."""
+    """Paints layers on top of each other; `u` and `v` are pixel centres relative to the anchor."""
 
     def __init__(self, left: float, right: float, up: float, down: float) -> None:
-        """Make a canvas that extends by this many pixels from the anchor to each side."""
+        """Create a canvas that extends by these numbers of pixels from the anchor to each side."""
         self._left, self._top = -int(np.ceil(left)) - 1, -int(np.ceil(up)) - 1
         width = int(np.ceil(right)) + 2 - self._left
         height = int(np.ceil(down)) + 2 - self._top

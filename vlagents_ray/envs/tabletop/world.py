@@ -14,19 +14,21 @@ import numpy as np
 
 PUCK_RADIUS = 0.022  # m
 PUCK_HEIGHT = 0.03  # m
-PAD_HALF = 0.045  # m, half the side of the square
+PAD_HALF = 0.045  # m, half of the square's side
 FINGER_RADIUS = 0.007  # m
-GAP_OPEN = 0.038  # m, from the gripper's centre to the inner face of a finger; closed it is 0
+# m, distance from the gripper's centre to the inner face of an open finger; 0 if closed.
+GAP_OPEN = 0.038
 REACH = ((-0.30, 0.30), (-0.23, 0.23), (0.0, 0.18))  # m, reach of the fingertips
 HOME = (0.0, 0.20, 0.16)  # m, initial position of the fingertips
 STEP_LIMIT = 0.03  # m, travel of one control step along each axis
 
-_TABLE = (0.30, 0.24)  # m, half extents; a rim keeps the pucks on it
+_TABLE = (0.30, 0.24)  # m, half extents of the table, whose rim keeps the pucks on it
 # Between two checks of contacts, a finger moves by at most 1 cm, which is less than its width.
 _SUBSTEPS = 3
-_OPENING_RATE = 0.5 / _SUBSTEPS  # share of the whole opening in a substep
-_CONTACT_PASSES = 4  # enough for a puck between two fingers to come to rest
-_FALL = 0.06 / _SUBSTEPS  # m, by which a puck falls in a substep
+# Change of the opening per substep, as a share of the whole opening.
+_OPENING_RATE = 0.5 / _SUBSTEPS
+_CONTACT_PASSES = 4  # number of iterations, enough for a puck between two fingers to come to rest
+_FALL = 0.06 / _SUBSTEPS  # m, distance that a puck falls per substep
 # m, largest distance of a grasped puck's centre from the line between the fingers.
 _GRASP_DEPTH = 0.012
 _LIFTED = 0.01  # m, height above which a puck counts as lifted
@@ -87,7 +89,9 @@ class TabletopWorld:
                 puck.lifted = puck.lifted or puck.z > _LIFTED
 
     def _travel(self, dx: float, dy: float) -> None:
-        """Move the fingertips and carried pucks horizontally, and push pucks in the way."""
+        """Move the fingertips and carried pucks horizontally, and push pucks that are in the
+        way.
+        """
         x, y = _clip(self.x + dx, REACH[0]), _clip(self.y + dy, REACH[1])
         dx, dy = x - self.x, y - self.y
         for puck in self._carried():
@@ -101,7 +105,7 @@ class TabletopWorld:
             self._push()
 
     def _push(self) -> None:
-        """Move the pucks that the fingers touch, and the pucks that are touched by those."""
+        """Move the pucks that the fingers touch, and the pucks that these pucks touch."""
         reach, offset = PUCK_RADIUS + FINGER_RADIUS, self.gap + FINGER_RADIUS
         for puck in self.pucks:
             if puck is self.held_puck or puck.z + PUCK_HEIGHT <= self.z + _EPSILON:
@@ -111,7 +115,8 @@ class TabletopWorld:
                 puck.x = _clip(puck.x, (self.x - slack, self.x + slack))
                 continue
             for _ in range(_CONTACT_PASSES):
-                # Both fingers push at once: in sequence they would push a centred puck aside.
+                # Both fingers push at once: if they pushed in sequence, they would push a centred
+                # puck aside.
                 finger_xs = (self.x - offset, self.x + offset)
                 overlaps = [_overlap(puck, finger_x, self.y, reach) for finger_x in finger_xs]
                 pushes = [overlap for overlap in overlaps if overlap is not None]
@@ -125,7 +130,7 @@ class TabletopWorld:
                 break
 
     def _separate(self) -> bool:
-        """Move overlapping pucks apart, once for each pair; return whether any moved."""
+        """Move overlapping pucks apart, once for each pair; return whether any puck moved."""
         moved = False
         for i, first in enumerate(self.pucks):
             for second in self.pucks[i + 1 :]:
@@ -182,7 +187,7 @@ class TabletopWorld:
     def _support(self, puck: Puck) -> float:
         """Return the height at which `puck` rests, m: on the table, or on a puck.
 
-        A puck supports another one if it is below the other's centre of mass.
+        A puck supports another puck if it is below the other puck's centre of mass.
         """
         height = 0.0
         for lower in self.pucks:
@@ -193,7 +198,7 @@ class TabletopWorld:
         return height
 
     def _carried(self) -> list[Puck]:
-        """List the held puck and those that are stacked on it."""
+        """Return the held puck and all pucks that are stacked on it."""
         if self.held_puck is None:
             return []
 
@@ -215,7 +220,7 @@ class TabletopWorld:
         )
 
     def _finger_over(self, puck: Puck) -> bool:
-        """Return whether a finger is above or inside a puck, whatever its height."""
+        """Return whether a finger is above or inside a puck, for any height of the finger."""
         reach = PUCK_RADIUS + FINGER_RADIUS - _EPSILON
         offset = self.gap + FINGER_RADIUS
         finger_xs = (self.x - offset, self.x + offset)
@@ -223,7 +228,8 @@ class TabletopWorld:
 
 
 def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, float] | None:
-    """Return the shift (dx, dy) that moves a puck to a distance from the point (x, y), m.
+    """Return the shift (dx, dy) that moves a puck to the given distance from the point (x, y),
+    m.
 
     Returns:
         The shift; None if the puck is at least that far away.
@@ -233,7 +239,8 @@ def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, fl
     if current >= distance - _EPSILON:
         return None
     if current < _EPSILON:
-        # At the centre any direction is valid, as long as it is always the same.
+        # If the puck is exactly at the point, any direction is valid, as long as it is always the
+        # same.
         return 0.0, -distance
     return dx * (distance / current - 1), dy * (distance / current - 1)
 
@@ -258,10 +265,11 @@ COLOURS = ("red", "green", "blue", "yellow", "purple")
 PUCKS = 4  # at most
 _PADS = 3
 _AREA = (0.22, 0.13)  # m, half extents of the area in which objects are placed
-_CLEARANCE = 0.09  # m between centres: a puck's own radius, an open finger, and the neighbour
+_CLEARANCE = 0.09  # m between the centres of two pucks: room for both pucks and an open finger
 _PAD_CLEARANCE = 0.125  # m between the centres of two pads
-_CORRIDOR = 0.065  # m on both sides of a slide that no other puck may be in
-_AT_PAD = PAD_HALF - 0.008  # m, largest distance of a puck's centre from the pad's, along each axis
+_CORRIDOR = 0.065  # m, width of the zone on both sides of a slide that must be free of other pucks
+# m, largest distance of a puck's centre from the pad's centre, along each axis.
+_AT_PAD = PAD_HALF - 0.008
 _LIFT_HEIGHT = 0.08  # m
 
 
@@ -292,7 +300,9 @@ class Goal:
         return at_pad and not (self.task == "slide" and puck.lifted)
 
     def target_position(self, world: TabletopWorld) -> tuple[float, float, float]:
-        """Return the target of the centre of the puck's underside in the base frame, x, y, z, m."""
+        """Return the target position of the centre of the puck's underside in the base frame, (x,
+        y, z), m.
+        """
         if self.target is None:
             puck = world.puck(self.puck)
             return puck.x, puck.y, _LIFT_HEIGHT
@@ -304,7 +314,7 @@ class Goal:
 
 
 def goals(world: TabletopWorld, task: Task) -> list[Goal]:
-    """List the goals of a task that are possible in this scene, in a fixed order."""
+    """Return the goals of a task that are possible in this scene, in a fixed order."""
     pucks = [puck.colour for puck in world.pucks]
     if task == "lift":
         return [Goal(task, puck) for puck in pucks]
@@ -323,7 +333,7 @@ def draw_episode(
 ) -> tuple[TabletopWorld, Goal]:
     """Draw a scene and a goal.
 
-    A goal of the task "slide" is drawn only if no other puck is in the way.
+    A goal of the task "slide" is drawn only if no other puck is in the way of the slide.
 
     Args:
         task: The task of the goal.
@@ -357,8 +367,10 @@ def _draw_scene(rng: np.random.Generator, count: int) -> TabletopWorld:
 
 
 def _draw_positions(rng: np.random.Generator, count: int) -> list[tuple[float, float]] | None:
-    """Draw the positions of pads and then pucks, m; None if there is no room for one of them."""
-    # x, y, and the clearance from objects of the same kind.
+    """Draw the positions of pads and then pucks, m; return None if there is no room for one of
+    them.
+    """
+    # Items: x, y, and the clearance from objects of the same kind.
     drawn: list[tuple[float, float, float]] = []
     for _ in range(200):
         if len(drawn) == count:
@@ -385,7 +397,8 @@ def _is_clear(world: TabletopWorld, goal: Goal) -> bool:
     for other in world.pucks:
         if other is start:
             continue
-        # The point of the slide that is nearest to the other puck, as a share of the slide.
+        # The point on the slide that is nearest to the other puck, as a share of the slide's
+        # length.
         share = ((other.x - start.x) * dx + (other.y - start.y) * dy) / length**2
         share = _clip(share, (0.0, 1.0))
         x, y = start.x + share * dx, start.y + share * dy
