@@ -1,5 +1,5 @@
-"""Clients in other languages and other policy servers: the list of measured ones, and a script that
-stands in for one.
+"""Clients in other languages and other policy servers: which of them are measured, and a script
+that stands in for such a system.
 """
 
 from __future__ import annotations

@@ -180,8 +180,8 @@ def haproxy_files(home: Path, times: int = 1) -> dict[str, Path]:
 
 @pytest.mark.slow
 def test_no_other_user_reaches_the_socket_that_commands_haproxy(tmp_path: Path) -> None:
-    """The files are neither in a folder that another user has created before, nor reachable through
-    a link.
+    """HAProxy's files are neither in a folder that another user has created before, nor reachable
+    through a link.
     """
     own = ingress_environment(tmp_path, "/bin/true")
     wanted = {name for name, value in own.items() if value.startswith(str(tmp_path))}

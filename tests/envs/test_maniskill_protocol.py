@@ -86,7 +86,9 @@ def test_results_say_which_protocol_was_followed_and_what_was_not() -> None:
 
 
 def test_a_batch_of_one_plays_what_a_single_environment_plays() -> None:
-    """On the CPU nothing more can be tested, since its physics has only one environment."""
+    """ManiSkill's physics on the CPU has only one environment, so a larger batch cannot be
+    tested.
+    """
     actions = np.random.default_rng(0).uniform(-1, 1, (5, 7)).astype(np.float32)
     with (
         ManiSkill("PegInsertionSide-v1", **SMALL) as alone,

@@ -334,7 +334,7 @@ def test_a_plan_in_whose_place_others_were_executed_is_dropped(actions: str) -> 
         "row 0 of the chunk for the scene that a human left"
     )
     assert session.episode is not None
-    assert len(session.episode.frames) == 2, "its history must be its observations"
+    assert len(session.episode.frames) == 2, "the policy's history must contain its observations"
 
 
 def test_samples_come_with_their_mean_and_change_no_action() -> None:

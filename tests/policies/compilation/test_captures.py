@@ -499,8 +499,8 @@ class Waiting(Agent):
 
 
 def captured_beside(cuda: FakeCuda, begin: Callable[[], queue.SimpleQueue[Any]]) -> Any:
-    """Capture a graph, begin something on another thread during the capture, and return its result,
-    which comes afterwards.
+    """Capture a graph, begin something on another thread during the capture, and return the result
+    of that work, which must end after the capture.
     """
     begun: list[queue.SimpleQueue[Any]] = []
 
