@@ -1,7 +1,9 @@
 """Counts the calls of Python, the system calls and the context switches of one warm inference call,
-in client and server, for each transport. Unlike times, these counts hardly depend on the machine
-and its load. Waiting does not count, as the number of polls depends on the time that the other side
-needs. System calls are counted by `strace`, if it is installed.
+in client and server, for each transport.
+
+Unlike times, these counts hardly depend on the machine and its load. Waiting does not count, as the
+number of polls depends on the time that the other side needs. System calls are counted by `strace`,
+if it is installed.
 """
 
 from __future__ import annotations

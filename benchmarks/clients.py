@@ -1,7 +1,9 @@
 """Measures round trips of the clients in other languages and of the Python client, interleaved at
-one server. Each client is a process, and all send the same raw pixels. Build the client in
-TypeScript first: `cd clients/typescript && npm ci && npm run build`. The C++ client is compiled
-here, with the packages in its README.md.
+one server.
+
+Each client is a process, and all send the same raw pixels. Build the client in TypeScript first:
+`cd clients/typescript && npm ci && npm run build`. The C++ client is compiled here, with the
+packages in its README.md.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError
 
 Calls = Annotated[int, typer.Option(min=1, help="Number of round trips for each client.")]
-Seconds = Annotated[float, typer.Option(min=0.1, help="Of each measurement.")]
+Seconds = Annotated[float, typer.Option(min=0.1, help="Duration of each measurement, in seconds.")]
 Rounds = Annotated[int, typer.Option(min=1)]
 Out = Annotated[Path | None, typer.Option("--out", help="File for the figures, as JSON.")]
 Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma; default: all.")]

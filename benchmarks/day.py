@@ -1,7 +1,9 @@
-"""Tests that a day of control has no jump: `python -m benchmarks.day --seed 1` simulates 24 hours
-at 50 Hz with faults. Control loop, chunk player, guard, watchdog and command inbox are those of a
-real robot; the arm, the network, the server, the operator and all clocks are simulated, so that a
-day takes some minutes, and a seed repeats it exactly. At each command the simulation checks:
+"""Tests that a day of control has no jump.
+
+`python -m benchmarks.day --seed 1` simulates 24 hours at 50 Hz with faults. Control loop, chunk
+player, guard, watchdog and command inbox are those of a real robot; the arm, the network, the
+server, the operator and all clocks are simulated, so that a day takes some minutes, and a seed
+repeats it exactly. At each command the simulation checks:
 
 - no step is above 3 times the largest step of a run without faults, or above the speed limit, even
   from the measured pose after a stop;

@@ -1,6 +1,8 @@
 """Environments of the measurements: a wrapper of any environment that records its times, and an
-environment that takes time but no CPU. This module imports only the standard library, numpy and
-this package's light part, since it is also imported in the other systems' Python.
+environment that takes time but no CPU.
+
+This module imports only the standard library, numpy and this package's light part, since it is also
+imported in the other systems' Python.
 """
 
 from __future__ import annotations
@@ -34,8 +36,9 @@ class EpisodeTimes(NamedTuple):
 
 class TimedEnv(EvalEnv):
     """Any environment, with a record of the beginning and end of each episode in one file per
-    process. The episode with seed `seed` begins in initial state `seed` modulo the number of
-    initial states.
+    process.
+
+    The episode with seed `seed` begins in initial state `seed` modulo the number of initial states.
     """
 
     def __init__(

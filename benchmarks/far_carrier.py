@@ -1,7 +1,9 @@
 """The process that carries the packets of a link between two hosts: `python -m
-benchmarks.far_carrier DEVICE PID PID`. Its arguments are the device's name in the hosts, and the
-first process of each host. It answers each line of `Conditions` with a line. It imports only the
-standard library, so that it starts quickly.
+benchmarks.far_carrier DEVICE PID PID`.
+
+Its arguments are the device's name in the hosts, and the first process of each host. It answers
+each line of `Conditions` with a line. It imports only the standard library, so that it starts
+quickly.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
 """A link between two hosts with delay, loss and cuts of IP packets, even if the kernel has no
-netem. Each host gets a TUN device, whose packets `benchmarks.far_carrier` carries to the other
-host. These are real packets of the kernel's own TCP, with real retransmissions, congestion control
-and head-of-line blocking.
+netem.
+
+Each host gets a TUN device, whose packets `benchmarks.far_carrier` carries to the other host. These
+are real packets of the kernel's own TCP, with real retransmissions, congestion control and
+head-of-line blocking.
 
     with hosts(2) as [cloud, home], FarLink(cloud, home) as link:
         link.set(Conditions(delay_ms=80, loss=0.02))

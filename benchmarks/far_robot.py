@@ -186,8 +186,10 @@ def drive(
     recovers: bool = False,
     began: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
-    """Run the robot with the policy for `seconds`, and return the record. With `recovers`, the run
-    ends earlier if the policy has controlled the robot for a second since a stop.
+    """Run the robot with the policy for `seconds`, and return the record.
+
+    With `recovers`, the run ends earlier if the policy has controlled the robot for a second since
+    a stop.
     """
     with NotingAgent(url, timeout_s=RESET_S) as agent:
         robot = FarRobot(agent.contract)

@@ -387,7 +387,9 @@ def main(
         float,
         typer.Option(min=0, help="Seconds before each measurement, as all robots start at once."),
     ] = 10.0,
-    seconds: Annotated[float, typer.Option(min=1, help="Of each measurement.")] = 20.0,
+    seconds: Annotated[
+        float, typer.Option(min=1, help="Duration of each measurement, in seconds.")
+    ] = 20.0,
     transport: Annotated[str, typer.Option(help="websocket, http or shm.")] = "websocket",
     rtc: Annotated[
         bool, typer.Option("--rtc", help="Send the remaining rows of the plan with each request.")

@@ -1,10 +1,10 @@
-"""Growth: a fleet of robots, and how the cost of an act changes with the number of sessions and of
-replicas.
+"""Measures a fleet of robots, and how the cost of an inference call changes with the number of
+sessions and of replicas.
 
 The policy does nothing; each client sends two 224x224 RGB cameras as JPEG. The fleet acts at its
 rate. Along a curve, all sessions together act at one low rate, so that only their number, or that
-of the replicas, differs. The ticks of each session begin at a random moment. An act counts from its
-tick, and is on time if it ends before the next one.
+of the replicas, differs. The ticks of each session begin at a random moment. The time of a call
+counts from its tick; a call is on time if it ends before the next tick.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import Server, running_server
 from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
-POLICY = "benchmarks.live:Measured"  # its `reset` returns the id of the replica's process
+POLICY = "benchmarks.live:Measured"  # its `reset` returns the process id of the replica
 TRANSPORTS = ("websocket", "http", "shm")  # transports of clients outside of Ray
 CURVES = ("sessions", "replicas")
-_PROCESSES = 4  # shared by the robots
-_AHEAD_S = 0.5  # by which the clients' processes know when to begin
+_PROCESSES = 4  # number of processes that share the robots
+_AHEAD_S = 0.5  # time before the beginning at which the clients' processes are informed of it, s
 _WARM_S = 1.0
 _LATE_S = 60.0
-_CONNECT_S = 0.1  # for each robot
+_CONNECT_S = 0.1  # time for each robot to connect, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,23 +50,23 @@ class GrowthPlan:
     """The settings of `measure_growth`."""
 
     robots: int = 64
-    hz: float = 10.0  # rate of each robot
+    hz: float = 10.0  # rate of each robot, Hz
     sessions: Sequence[int] = (1, 4, 16, 64, 256, 1000)
     replicas: Sequence[int] = (1, 2, 4, 8)
-    acts_per_s: float = 50.0  # of all sessions of a point of a curve
-    seconds: float = 20.0  # seconds of each measurement
+    acts_per_s: float = 50.0  # actions per second of all sessions at each point of a curve
+    seconds: float = 20.0  # duration of each measurement, s
     transport: str = "websocket"
 
 
 def measure_growth(
     plan: GrowthPlan, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Measure the fleet and both curves; returns plain JSON values.
+    """Measure the fleet and both curves, and return plain JSON values.
 
     The curve of replicas has as many sessions as there are robots.
     """
     rate = plan.acts_per_s
-    # Those of the measurement before may still be ending.
+    # Sessions of the previous measurement may still be ending.
     limit = 2 * max(plan.robots, *plan.sessions)
     found: dict[str, Any] = {"plan": asdict(plan), "sessions": [], "replicas": []}
     for replicas in sorted({1, *plan.replicas}):
@@ -135,10 +135,11 @@ def _point(plan: GrowthPlan, server: Server, sessions: int, hz: float) -> dict[s
 
 
 def figures(ms: np.ndarray, hz: float) -> dict[str, Any]:
-    """Return the share on time of all ticks, and quantiles of acts at the rate `hz` that end
-    `ms` after their ticks.
+    """Return the share of ticks whose call was on time, and quantiles of the calls, which end `ms`
+    after their ticks at the rate `hz`.
     """
-    ticks = np.maximum(1, np.ceil(ms * hz / 1e3))  # each act's own, and those that passed during it
+    # The tick of each call, and the ticks that passed during the call.
+    ticks = np.maximum(1, np.ceil(ms * hz / 1e3))
     return {
         "on_time": float(np.sum(ms * hz <= 1e3) / np.sum(ticks)),
         "p50_ms": float(np.median(ms)),
@@ -185,7 +186,9 @@ def show_growth(found: Mapping[str, Any]) -> None:
 
 
 def plot_growth(found: Mapping[str, Any], file: Path) -> None:
-    """Draw the median and the CPU time of an act by the number of sessions, and of replicas."""
+    """Draw the median and the CPU time of a call by the number of sessions, and by the number of
+    replicas.
+    """
     figure = require("matplotlib.figure").Figure(figsize=(9, 3.5), layout="constrained")
     for axes, name in zip(figure.subplots(1, 2, sharey=True), CURVES, strict=True):
         counts = [one[name] for one in found[name]]
@@ -207,25 +210,33 @@ def plot_growth(found: Mapping[str, Any], file: Path) -> None:
 
 def main(
     robots: Annotated[
-        int, typer.Option(min=1, help="Of the fleet; also the sessions of the curve of replicas.")
+        int,
+        typer.Option(
+            min=1, help="Number of robots of the fleet, and of sessions in the curve of replicas."
+        ),
     ] = 64,
-    hz: Annotated[float, typer.Option(min=0.1, help="Of each robot of the fleet.")] = 10.0,
+    hz: Annotated[
+        float, typer.Option(min=0.1, help="Rate of each robot of the fleet, in Hz.")
+    ] = 10.0,
     sessions: Annotated[
         str, typer.Option(help="Numbers of sessions with one replica.")
     ] = "1,4,16,64,256,1000",
     replicas: Annotated[str, typer.Option(help="Numbers of replicas.")] = "1,2,4,8",
     rate: Annotated[
-        float, typer.Option(min=10, help="Acts a second of all sessions of a curve together.")
+        float,
+        typer.Option(min=10, help="Actions per second of all sessions at each point of a curve."),
     ] = 50.0,
-    seconds: Annotated[float, typer.Option(min=1, help="Of each measurement.")] = 20.0,
+    seconds: Annotated[
+        float, typer.Option(min=1, help="Duration of each measurement, in seconds.")
+    ] = 20.0,
     transport: Annotated[str, typer.Option(help="websocket, http or shm.")] = "websocket",
     out_file: Out = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", help="Draw the curves here: .png, .svg or .pdf.")
     ] = None,
 ) -> None:
-    """Measure a fleet of robots, and the cost of an act by the number of sessions and of
-    replicas.
+    """Measure a fleet of robots, and the cost of a call by the number of sessions and
+    of replicas.
     """
     with errors():
         if transport not in TRANSPORTS:

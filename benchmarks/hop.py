@@ -1,5 +1,5 @@
-"""Cost of a child process behind the replica: `act` of a policy that does nothing, in either
-process, interleaved.
+"""Measures the cost of a child process behind the replica: calls of `act` of a policy that does
+nothing, in either process, interleaved.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _WARM_UP = 20
 def measure_hop(
     calls: int, python: str = sys.executable, progress: Callable[[str], None] = lambda _: None
 ) -> RoundTripsOfAll:
-    """Measure `calls` acts in each process, as the engine calls them.
+    """Measure `calls` calls of `act` in each process, as the engine makes them.
 
-    `python` is the child's interpreter; `ConfigError` if no policy can run there.
+    `python` is the child's interpreter; raises `ConfigError` if no policy can run in it.
     """
     probe(python)
     with contextlib.ExitStack() as stack:
@@ -47,7 +47,7 @@ def measure_hop(
 
 
 class _Driver:
-    """An agent with one session, called as an engine calls it."""
+    """Calls an agent with one session as an engine does."""
 
     def __init__(self, agent: Agent) -> None:
         agent.initialize()
@@ -61,7 +61,7 @@ class _Driver:
         return {}
 
     def measure(self, calls: int) -> list[float]:
-        """Make calls; returns their durations, ms."""
+        """Make calls, and return their durations, ms."""
         taken = []
         for _ in range(calls):
             begun = time.perf_counter()
@@ -71,14 +71,14 @@ class _Driver:
 
 
 def main(
-    calls: Annotated[int, typer.Option(min=1, help="Acts by each way.")] = 2000,
+    calls: Annotated[int, typer.Option(min=1, help="Number of calls in each process.")] = 2000,
     python: Annotated[
         str, typer.Option(help="The child's interpreter; default: this one.")
     ] = sys.executable,
     out_file: Out = None,
 ) -> None:
-    """Measure the cost of a policy in a child process behind the replica, against one in the
-    replica.
+    """Measure the cost of a policy in a child process behind the replica, compared with a policy in
+    the replica.
     """
     with errors():
         found = measure_hop(calls, python, progress).to_json()

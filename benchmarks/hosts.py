@@ -1,10 +1,10 @@
 """Several simulated hosts on one machine for Ray, Slurm and networks, and a Ray cluster over them.
 
 Each host has its own address, host name, processes, shared memory and boot id; a switch connects
-them, apart from the machine's network. Links can be limited and cut, hosts can be killed. They
-share the machine's CPUs, memory, files (except /dev/shm, /tmp/ray and /etc/hosts) and GPUs.
-Processes in a host end with it, and hosts end with the process that made them, however that ends.
-Needs Linux and root.
+the hosts, separately from the machine's network. Links can be limited and cut, and hosts can be
+killed. Hosts share the machine's CPUs, memory, files (except /dev/shm, /tmp/ray and /etc/hosts) and
+GPUs. Processes in a host end when the host ends, and hosts end when the process that made them ends
+in any way. Needs Linux and root.
 
     with hosts(3) as [head, second, robot], ray_cluster([head, second]) as cluster:
         head.run(["ray", "status"])
@@ -32,12 +32,14 @@ from typing import Any
 from benchmarks.link import shaping
 from vlagents_ray.errors import ConfigError, VLAgentsError
 
-_NETWORK = "198.18.0."  # RFC 2544's, for tests of networks
+_NETWORK = "198.18.0."  # network of RFC 2544 for tests
 _TOOLS = ("ip", "tc", "unshare", "nsenter", "setpriv", "mount")
-_PORT = 6379  # port of Ray's head, its default: each host has all ports
+_PORT = 6379  # port of Ray's head, Ray's default: each host has all ports
 _BEGIN_S = 10.0
-_RAY_S = 300.0  # an evaluation on four workers took more than 120 s on a busy machine
-# The first process of a host: ends nothing, and waits for orphans, which would stay zombies.
+# Time limit, s: an evaluation on four workers took more than 120 s on a busy machine.
+_RAY_S = 300.0
+# The first process of a host: it ends no process, and waits for orphans, which would otherwise
+# remain zombies.
 _INIT = "trap : TERM INT; while :; do sleep 86400 & wait $!; done"
 
 
@@ -50,16 +52,16 @@ class Host:
     """A host. `number` counts from 1."""
 
     number: int
-    folder: Path  # outside, for its private files
-    pid: int  # process id of its first process, in the outer namespace
-    switch: int  # of the switch's process
-    # Variables of its processes, in addition to this process's.
+    folder: Path  # folder outside the host for the host's private files
+    pid: int  # process id of the host's first process, in the outer namespace
+    switch: int  # process id of the switch
+    # Variables of the host's processes, in addition to this process's.
     environment: dict[str, str] = field(default_factory=dict)
     _keeper: Any = None
 
     @property
     def name(self) -> str:
-        """The host name, by which the others can also connect."""
+        """The host name, with which the other hosts can also connect."""
         return f"host{self.number}"
 
     @property
@@ -80,32 +82,34 @@ class Host:
         return subprocess.Popen(self.command(command), text=True, **options)
 
     def run(self, command: Sequence[str], timeout_s: float = _RAY_S) -> str:
-        """Run a command; returns its standard output. Raises `HostFailed` if it fails or takes
-        longer.
+        """Run a command, and return its standard output. Raises `HostFailed` if the command fails
+        or takes too long.
         """
         return _output(self.command(command), timeout_s)
 
     def cut(self) -> None:
-        """Disconnect its network."""
+        """Disconnect the host's network."""
         self._switch(["ip", "link", "set", f"port{self.number}", "down"])
 
     def heal(self) -> None:
-        """Connect its network again."""
+        """Connect the host's network again."""
         self._switch(["ip", "link", "set", f"port{self.number}", "up"])
 
     def limit(self, rate: str) -> None:
-        """Limit the rate of its link in either direction, in the notation of `tc`: "1gbit"."""
+        """Limit the rate of the host's link in each direction, in the notation of `tc`: "1gbit"."""
         for words in shaping(rate, None):
             self._switch(["tc", "qdisc", "replace", "dev", f"port{self.number}", *words])
             self.run(["tc", "qdisc", "replace", "dev", "eth0", *words])
 
     def sent_bytes(self) -> int:
-        """Return the bytes that it has sent to other hosts so far, with headers."""
+        """Return the number of bytes, including headers, that the host has sent to other hosts so
+        far.
+        """
         links = json.loads(self.run(["ip", "-json", "-statistics", "link"]))
         return sum(link["stats64"]["tx"]["bytes"] for link in links if link["ifname"] != "lo")
 
     def kill(self) -> None:
-        """Kill all its processes at once, as a power failure does."""
+        """Kill all processes of the host at once, like a power failure."""
         _end(self._keeper, self.pid)
 
     def _switch(self, command: Sequence[str]) -> None:
@@ -114,7 +118,7 @@ class Host:
 
 @contextlib.contextmanager
 def hosts(number: int) -> Iterator[list[Host]]:
-    """Make `number` hosts that reach only each other. Raises as `require` does."""
+    """Make `number` hosts that reach only each other. Raises the errors of `require`."""
     require()
     with tempfile.TemporaryDirectory(prefix="hosts-") as top, contextlib.ExitStack() as stack:
         switch = _first_process(stack, ["--net"])
@@ -134,12 +138,13 @@ def hosts(number: int) -> Iterator[list[Host]]:
         try:
             yield made
         finally:
-            for host in made:  # all at once, as the kernel takes a second or two for each
+            # All hosts are killed at once, as the kernel takes a second or two for each.
+            for host in made:
                 host._keeper.kill()
 
 
 def require() -> None:
-    """Raise `ConfigError` unless this machine and user can have hosts."""
+    """Raise `ConfigError` unless this machine and user can make hosts."""
     if missing := [tool for tool in _TOOLS if shutil.which(tool) is None]:
         raise ConfigError(
             f"hosts: {', '.join(missing)} not found; install iproute2, util-linux and mount"
@@ -222,12 +227,12 @@ def _set_up(host: Host, switch: Sequence[str], number: int) -> None:
     )
     (host.folder / "boot_id").write_text(f"{uuid.uuid4()}\n")
     (host.folder / "ray").mkdir()
-    Path("/tmp/ray").mkdir(exist_ok=True)  # noqa: S108 - where Ray has it
+    Path("/tmp/ray").mkdir(exist_ok=True)  # noqa: S108 - Ray uses this folder
     for command in (
         "ip link set lo up",
         f"ip address add {host.address}/24 dev eth0",
         "ip link set eth0 up",
-        # Ray determines a host's own address by its route to the internet.
+        # Ray determines a host's own address from the route to the internet.
         "ip route add default dev eth0",
         f"hostname {host.name}",
         f"mount --bind {host.folder / 'hosts'} /etc/hosts",
@@ -273,7 +278,7 @@ class RayCluster:
         return f"{self.head.address}:{_PORT}"
 
     def python(self, code: str, *arguments: str, timeout_s: float = _RAY_S) -> str:
-        """Run a driver at the head; returns what it prints."""
+        """Run a driver at the head, and return its output."""
         return self.head.run([sys.executable, "-c", code, *arguments], timeout_s)
 
     def join(self, host: Host, cpus: float, **options: str) -> None:
@@ -289,10 +294,10 @@ def ray_cluster(
     environment: Mapping[str, str] | None = None,
     **options: str,
 ) -> Iterator[RayCluster]:
-    """Start Ray with `cpus` logical CPUs on each host, and Ray's token; `options` are further ones
-    of `ray start`.
+    """Start Ray with `cpus` logical CPUs on each host, and with Ray's token.
 
-    `environment` is that of all processes started in the hosts from now on.
+    `options` are further options of `ray start`; `environment` is the environment of all processes
+    that are started in the hosts from now on.
     """
     shared = {
         "RAY_AUTH_MODE": "token",

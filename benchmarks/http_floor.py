@@ -1,12 +1,14 @@
-"""HTTP with JPEG against its floor: a bare application that answers 200, with coded images.
+"""Compares HTTP with JPEG with its lower bound: a bare application that decodes the images and
+answers 200.
 
-In one run, interleaved: our HTTP and WebSocket clients, vlagents' JPEG client, and the bare
+One run measures, interleaved: our HTTP and WebSocket clients, vlagents' JPEG client, and the bare
 application, once directly and once behind an HAProxy with the settings of a server. The bare
-application only decodes the frame. Its client only encodes one, and posts it by `http.client`. So a
-round trip to it is the least that a request with these images takes on that way.
+application only decodes the frame, and its client only encodes a frame and posts it with
+`http.client`. A round trip to it is therefore the minimum time of a request with these images over
+HTTP.
 
-`python -m benchmarks.http_floor` measures; with `serve` and `drive` it is the bare application and
-its client.
+`python -m benchmarks.http_floor` measures; with `serve` and `drive` it runs the bare application
+and its client.
 """
 
 from __future__ import annotations
@@ -89,12 +91,12 @@ def _serve(is_proxied: bool) -> None:
 
 @contextlib.contextmanager
 def _haproxy(port: int) -> Iterator[int]:
-    """Run HAProxy in front of a port, with the settings that Serve writes; yield its own port."""
+    """Run HAProxy in front of a port, with the settings that Serve writes; yield HAProxy's port."""
     binary = haproxy_binary()
     if binary is None:
         raise ConfigError("expected HAProxy, which is not installed; see docs/install.md")
     with tempfile.TemporaryDirectory(dir="/tmp") as name:
-        # Serve reads these when it is imported.
+        # Serve reads these variables when it is imported.
         os.environ.update(ingress_environment(Path(name), str(binary)))
         from ray.serve._private.haproxy import (
             BackendConfig,
@@ -148,7 +150,9 @@ def _drive(port: int) -> None:
     _wait_for(port)
 
     def measure_turn(calls: int) -> list[float]:
-        """Make calls over a new connection, since HAProxy closes one that is idle between turns."""
+        """Make calls over a new connection, since HAProxy closes a connection that is idle between
+        turns.
+        """
         connection = http.client.HTTPConnection(LOOPBACK, port)
         connection.connect()
         connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -181,10 +185,10 @@ def bare_application(_obs: Path, *, is_proxied: bool) -> Iterator[ProcessDriver]
 
 
 def measure_floor(calls: int, peers_python: Path) -> dict[str, Any]:
-    """Measure the round trips and the CPU time of acts over HTTP, and of the bare application.
+    """Measure the round trips and the CPU time of calls over HTTP, and of the bare application.
 
     Args:
-        calls: Round trips of each client.
+        calls: Number of round trips of each client.
         peers_python: The Python in which vlagents is installed.
 
     Returns:
@@ -203,7 +207,7 @@ def measure_floor(calls: int, peers_python: Path) -> dict[str, Any]:
 def main(
     calls: Calls = 1000, peers_python: others.PeersPython = others.PYTHON, out_file: Out = None
 ) -> None:
-    """Measure HTTP with JPEG against a bare application, the WebSocket, and vlagents."""
+    """Compare HTTP with JPEG with a bare application, the WebSocket, and vlagents."""
     with errors():
         origin = measured_on("python -m benchmarks.http_floor")
         found = measure_floor(calls, peers_python)

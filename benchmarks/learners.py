@@ -1,12 +1,12 @@
-"""What does a learner gain, and what does it cost?
+"""Measures the gains and the costs of learners.
 
 Each learner improves the reference policy on the tabletop, once for each seed and always from the
 same checkpoint:
 
 - `dagger`: the policy runs episodes, an expert takes over, and the policy is trained on the frames
   of the expert (examples/reference/dagger.py);
-- `cloning`: as many optimizer steps on demonstrations of the expert alone, stored without loss as
-  the corrections of `dagger` are;
+- `cloning`: the same number of optimizer steps on demonstrations of the expert alone, stored
+  without loss like the corrections of `dagger`;
 - `cloning_h264`: the same on demonstrations that were stored as usual, in lossy H.264;
 - `grpo`, `ppo`: reinforcement learning from the reward alone (examples/learn/flow.py).
 
@@ -14,9 +14,9 @@ same checkpoint:
     python -m benchmarks.learners_page examples/reference/learners.json
 
 All learners use one thread. Each new policy then runs the same held-out episodes of the tabletop as
-the first one, and episodes of Meta-World, which no learner trains on: what does it forget? A series
-that was interrupted continues; a step that was interrupted begins again, so that its costs are
-those of the whole step.
+the first policy. It also runs episodes of Meta-World, on which no learner trains, to measure what
+the policy forgets. An interrupted series continues; an interrupted step begins again, so that its
+costs are those of the whole step.
 """
 
 from __future__ import annotations
@@ -48,15 +48,17 @@ from vlagents_ray.serve.local_agent import LocalPolicy
 ROOT = Path(__file__).parents[1]
 CHECKPOINT = ROOT / "examples/reference/checkpoint"
 BEFORE = "before"  # the folder of the policy that all learners begin with
-EXECUTE = 4  # rows of a chunk
-TOGETHER = 16  # episodes of the tabletop that run at once
+EXECUTE = 4  # number of executed rows of a chunk
+TOGETHER = 16  # number of tabletop episodes that run at the same time
 COSTS = "costs.json"
-SEEDS_APART = 10_000  # between the first episodes of two seeds, which share none
-CORRECTIONS, DEMONSTRATIONS = 2_000_000, 3_000_000  # first seeds; those of evaluations begin at 0
-RATE = "5e-4"  # learning rate of dagger and cloning
+SEEDS_APART = 10_000  # distance of the first episodes of two seeds, so that no episodes are shared
+# First seeds of recordings and trainings; seeds of evaluations begin at 0.
+CORRECTIONS, DEMONSTRATIONS = 2_000_000, 3_000_000
+RATE = "5e-4"  # learning rate of `dagger` and `cloning`
 MOST_SEEDS = 10
-REINFORCEMENT = ("grpo", "ppo")  # of examples/learn/flow.py
-# The memory of a training is kept, as in examples/reference/make.sh; one thread for each step.
+REINFORCEMENT = ("grpo", "ppo")  # learners of examples/learn/flow.py
+# Variables of the trainings: their memory is kept, as in examples/reference/make.sh, and each step
+# has one thread.
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "MALLOC_ARENA_MAX": "1",
@@ -91,12 +93,12 @@ SUITES: dict[str, dict[str, Any]] = {
 class Sizes:
     """The amount of work of each learner and of the evaluations."""
 
-    recorded: int = 800  # episodes that `dagger` and `cloning` run
-    steps: int = 600  # steps of the optimizer, in `dagger` and `cloning`
-    iterations: int = 20  # iterations of `grpo` and `ppo`
-    rollouts: int = 512  # episodes of an iteration
-    held_out: int = 500  # episodes of the tabletop
-    metaworld: int = 25  # episodes of each task of Meta-World; 0: none
+    recorded: int = 800  # number of episodes that `dagger` and `cloning` run
+    steps: int = 600  # number of optimizer steps in `dagger` and `cloning`
+    iterations: int = 20  # number of iterations of `grpo` and `ppo`
+    rollouts: int = 512  # number of episodes of an iteration
+    held_out: int = 500  # number of evaluated episodes of the tabletop
+    metaworld: int = 25  # number of evaluated episodes of each task of Meta-World; 0 for none
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,8 @@ class Step:
 
     name: str
     command: Sequence[str]
-    result: Path  # what the command makes; missing if it was interrupted
+    # The file or folder that the command makes; missing if the command was interrupted.
+    result: Path
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ class LearnerRun:
 
     @property
     def learned(self) -> Path:
-        """The folder of examples/learn/flow.py."""
+        """The output folder of examples/learn/flow.py."""
         return self.folder / "learned"
 
     @property
@@ -152,7 +155,9 @@ def cloning_h264_steps(run: LearnerRun, sizes: Sizes) -> list[Step]:
 
 
 def reinforcement_steps(run: LearnerRun, sizes: Sizes) -> list[Step]:
-    """Return the training of `grpo` or `ppo`, with the least evaluation that its program allows."""
+    """Return the training of `grpo` or `ppo`, with the smallest evaluation that the program
+    allows.
+    """
     options = {
         "--seed": run.seed,
         "--iterations": sizes.iterations,
@@ -228,7 +233,7 @@ def learn(run: LearnerRun, sizes: Sizes) -> dict[str, dict[str, float]]:
         shutil.rmtree(run.folder / "train", ignore_errors=True)
         costs[step.name] = _execute(step, run.folder / f"{step.name}.log")
         file.write_text(json.dumps(costs, indent=1) + "\n")
-    shutil.rmtree(run.folder / "train", ignore_errors=True)  # images, a gigabyte
+    shutil.rmtree(run.folder / "train", ignore_errors=True)  # removes the images, a gigabyte
     return costs
 
 
@@ -264,11 +269,11 @@ def episodes_of(run: LearnerRun, sizes: Sizes) -> dict[str, int]:
     return {"demonstrations": kept}
 
 
-Solved = dict[tuple[str, int], bool]  # by environment and seed
+Solved = dict[tuple[str, int], bool]  # whether each episode was solved, by environment and seed
 
 
 def played(suite: str, checkpoint: Path, folder: Path, episodes: int) -> Solved:
-    """Run the episodes of a suite that have no result in the folder yet.
+    """Run those episodes of a suite that have no result in the folder yet.
 
     Args:
         suite: One of `SUITES`; the embodiment of the policy has the same name.
@@ -298,7 +303,7 @@ def played(suite: str, checkpoint: Path, folder: Path, episodes: int) -> Solved:
 
 
 def pairs_of(after: Solved, before: Solved) -> Pairs:
-    """Count the episodes that both, one or none of two policies solved."""
+    """Count the episodes that both policies, one of them, or neither solved."""
     both = sum(after[key] and before[key] for key in after)
     only_after = sum(after[key] and not before[key] for key in after)
     only_before = sum(before[key] and not after[key] for key in after)
@@ -306,7 +311,7 @@ def pairs_of(after: Solved, before: Solved) -> Pairs:
 
 
 def rates_of(solved: Solved) -> dict[str, list[int]]:
-    """Return the solved episodes and all episodes of each environment."""
+    """Return the numbers of solved episodes and of all episodes of each environment."""
     rates: dict[str, list[int]] = {}
     for (env, _), is_solved in sorted(solved.items()):
         rate = rates.setdefault(env, [0, 0])
@@ -321,10 +326,12 @@ class Series:
     def __init__(self, folder: Path, sizes: Sizes) -> None:
         self._folder = folder.resolve()
         self._sizes = sizes
-        self._first: dict[str, Solved] = {}  # of the policy before the training, by suite
+        self._first: dict[str, Solved] = {}  # results of the policy before the training, by suite
 
     def suites(self) -> dict[str, int]:
-        """Return the episodes of each environment by suite, without suites of no episodes."""
+        """Return the number of episodes of each environment by suite, without suites that have
+        none.
+        """
         episodes = {"tabletop": self._sizes.held_out, "metaworld": self._sizes.metaworld}
         return {suite: number for suite, number in episodes.items() if number}
 
@@ -342,7 +349,8 @@ class Series:
         figures: dict[str, Any] = {
             "learner": learner,
             "seed": seed,
-            # Steps of the optimizer; reinforcement learning takes as many as its episodes need.
+            # Number of optimizer steps; reinforcement learning makes as many steps as its episodes
+            # need.
             "steps": None if learner in REINFORCEMENT else self._sizes.steps,
             "episodes": episodes_of(run, self._sizes),
             "cpu_s": sum(cost["cpu_s"] for cost in costs.values()),
@@ -362,24 +370,24 @@ def main(
     learners: Annotated[
         str, typer.Option(help=f"Some of {','.join(LEARNERS)}; default: all.")
     ] = ",".join(LEARNERS),
-    seeds: Annotated[str, typer.Option(help="Seeds, of recordings and trainings.")] = "0,1,2,3,4",
+    seeds: Annotated[str, typer.Option(help="Seeds of recordings and trainings.")] = "0,1,2,3,4",
     recorded: Annotated[
-        int, typer.Option(min=1, help="Episodes that dagger and cloning record.")
+        int, typer.Option(min=1, help="Number of episodes that dagger and cloning record.")
     ] = Sizes.recorded,
     steps: Annotated[
-        int, typer.Option(min=1, help="Optimizer steps of dagger and cloning.")
+        int, typer.Option(min=1, help="Number of optimizer steps of dagger and cloning.")
     ] = Sizes.steps,
     iterations: Annotated[
-        int, typer.Option(min=1, help="Iterations of grpo and ppo.")
+        int, typer.Option(min=1, help="Number of iterations of grpo and ppo.")
     ] = Sizes.iterations,
     rollouts: Annotated[
-        int, typer.Option(min=1, help="Episodes of an iteration of grpo and ppo.")
+        int, typer.Option(min=1, help="Number of episodes of an iteration of grpo and ppo.")
     ] = Sizes.rollouts,
     held_out: Annotated[
-        int, typer.Option(min=1, help="Held-out episodes of the tabletop.")
+        int, typer.Option(min=1, help="Number of held-out episodes of the tabletop.")
     ] = Sizes.held_out,
     metaworld: Annotated[
-        int, typer.Option(min=0, help="Episodes of each task of Meta-World; 0: none.")
+        int, typer.Option(min=0, help="Number of episodes of each task of Meta-World; 0: none.")
     ] = Sizes.metaworld,
     results: Annotated[
         Path | None, typer.Option(help="File of the figures, as JSON, written after each run.")
@@ -393,7 +401,8 @@ def main(
             raise ConfigError(f"--learners: expected only {list(LEARNERS)}, got {unknown}")
         numbers = parse_seeds(seeds)
         sizes = Sizes(recorded, steps, iterations, rollouts, held_out, metaworld)
-        require("torch").set_num_threads(1)  # of the evaluations; other numbers round differently
+        # Threads of the evaluations, as another number would round differently.
+        require("torch").set_num_threads(1)
         series = Series(folder, sizes)
 
         figures: dict[str, Any] = {"sizes": asdict(sizes), "before": series.before(), "runs": []}
@@ -413,7 +422,7 @@ def parse_seeds(text: str) -> list[int]:
     """Return the seeds of a list with commas.
 
     Raises:
-        ConfigError: They are not different numbers from 0 on, or too many.
+        ConfigError: The seeds are not different numbers of at least 0, or there are too many.
     """
     words = parse_list(text)
     if not all(word.isdecimal() for word in words) or not 1 <= len(set(words)) <= MOST_SEEDS:

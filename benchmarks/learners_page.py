@@ -1,4 +1,4 @@
-"""The table and the picture of `benchmarks.learners`.
+"""Makes the table and the picture of `benchmarks.learners`.
 
 `python -m benchmarks.learners_page examples/reference/learners.json --picture
 docs/pictures/learners.svg` prints the table as Markdown. The same table in docs/ is written by
@@ -29,7 +29,7 @@ NAMES = {
     "ppo": "PPO",
 }
 KINDS = ("demonstrations", "rollouts", "interventions")  # kinds of episodes
-# The 97.5 % quantiles of Student's t-distribution, from 1 degree of freedom on.
+# The 97.5 % quantiles of Student's t-distribution for 1, 2, … degrees of freedom.
 _T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
@@ -38,16 +38,19 @@ class LearnerRow:
     """The figures of all runs of a learner with the same number of optimizer steps."""
 
     learner: str
-    steps: int | None  # steps of the optimizer, if they are a setting
+    steps: int | None  # number of optimizer steps, if it is a setting
     seeds: tuple[int, ...]
-    episodes: Mapping[str, float]  # by kind, means of the runs
-    cpu_s: float | None  # mean of the runs whose CPU time was measured
-    cpu_runs: int  # their number
+    episodes: Mapping[str, float]  # mean numbers of episodes per run, by kind
+    cpu_s: float | None  # mean CPU time of the runs whose CPU time was measured, s
+    cpu_runs: int  # number of runs
     success: tuple[float, ...]  # success of each run, in [0, 1]
     gains: tuple[float, ...]  # gains of each run over the policy before it
-    pairs: Pairs | None  # pairs of the episodes of a single run; None if there are several runs
-    largest_p: float | None  # largest p of McNemar's tests of the runs; None if a run has none
-    metaworld: tuple[int, int] | None  # solved episodes and all, of all runs that were evaluated
+    # Counts of the pairs of episodes of a single run; None if there are several runs.
+    pairs: Pairs | None
+    # Largest p value of McNemar's tests of the runs; None if a run has none.
+    largest_p: float | None
+    # Numbers of solved episodes and of all episodes, over all evaluated runs.
+    metaworld: tuple[int, int] | None
 
 
 def label(learner: str, steps: int | None) -> str:
@@ -56,13 +59,13 @@ def label(learner: str, steps: int | None) -> str:
 
 
 def rate_of(rates: Mapping[str, Sequence[int]]) -> tuple[int, int]:
-    """Return the solved episodes and all episodes of all environments."""
+    """Return the numbers of solved episodes and of all episodes over all environments."""
     return sum(rate[0] for rate in rates.values()), sum(rate[1] for rate in rates.values())
 
 
 def learner_rows(figures: Mapping[str, Any]) -> list[LearnerRow]:
     """Return a row for each learner of `benchmarks.learners` and number of optimizer steps, the
-    best one first.
+    best row first.
     """
     solved_before, held_out = rate_of(figures["before"]["tabletop"])
     rows = []
@@ -113,7 +116,9 @@ def _pairs(tabletop: Mapping[str, Any]) -> Pairs | None:
 
 
 def _metaworld(runs: Sequence[Mapping[str, Any]]) -> tuple[int, int] | None:
-    """Return the solved episodes and all episodes of Meta-World; None if no run has any."""
+    """Return the numbers of solved episodes and of all episodes of Meta-World; None if no run has
+    any.
+    """
     rates = [rate_of(run["metaworld"]["rates"]) for run in runs if "metaworld" in run]
     if not rates:
         return None
@@ -123,8 +128,8 @@ def _metaworld(runs: Sequence[Mapping[str, Any]]) -> tuple[int, int] | None:
 def gain_interval(row: LearnerRow) -> tuple[float, float, float]:
     """Return the mean gain of the runs and its 95 % interval.
 
-    The interval of several runs is that of Student's t-distribution over seeds. A single run has
-    the interval of its pairs of episodes, which knows nothing of other seeds.
+    The interval of several runs is based on Student's t-distribution over seeds. The interval of a
+    single run is based on its pairs of episodes, and does not account for other seeds.
     """
     if row.pairs is None:
         return mean_interval(row.gains)
@@ -132,13 +137,13 @@ def gain_interval(row: LearnerRow) -> tuple[float, float, float]:
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the mean and its 95 % interval by Student's t-distribution.
+    """Return the mean and its 95 % interval with Student's t-distribution.
 
     Args:
-        values: One for each run.
+        values: One value for each run.
 
     Returns:
-        The mean and the bounds of the interval; these are NaN if there is one run.
+        The mean and the bounds of the interval; the bounds are NaN if there is only one run.
     """
     mean = fmean(values)
     if len(values) == 1:
@@ -227,7 +232,7 @@ def points_of(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
     points = []
     for run in figures["runs"]:
         solved, episodes = rate_of(run["tabletop"]["rates"])
-        # The interventions of DAgger are in episodes that are already counted as rollouts.
+        # The interventions of DAgger are in episodes that already count as rollouts.
         used = run["episodes"].get("rollouts", run["episodes"].get("demonstrations"))
         points.append(
             {

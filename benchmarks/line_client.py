@@ -2,8 +2,8 @@
 `vlagents_ray_cluster.tune.line_process` starts.
 
 A client writes one line of JSON when it is connected and warm. Then each line of its input is a
-number of calls to make, which it answers with a JSON list of their milliseconds. It ends with its
-standard input or with its parent. This file needs only the standard library, as the scripts of
+number of calls to make, which it answers with a JSON list of the calls' durations, ms. It ends when
+its standard input or its parent ends. This file needs only the standard library, as the scripts of
 other policy servers (`benchmarks/peers`) load it with a Python without vlagents_ray.
 """
 
@@ -14,11 +14,11 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any, TextIO
 
-WARM_UP = 20  # calls
+WARM_UP = 20  # number of calls before measuring
 
 
 def timed(prepare: Callable[[], Any], call: Callable[[Any], object], calls: int) -> list[float]:
-    """Make `calls` calls; return the milliseconds of each, excluding `prepare`, which makes the
+    """Make `calls` calls; return the duration of each, ms, without `prepare`, which makes the
     observation.
     """
     taken = []

@@ -1,9 +1,9 @@
-"""Round trips over a real network link on one machine: two network namespaces, joined by a shaped
-veth pair.
+"""Measures round trips over a real network link on one machine: two network namespaces, connected
+by a shaped veth pair.
 
-The servers live in one namespace, the clients in the other. A namespace ends with its last process,
-and each process here ends with its parent or its standard input: nothing is left, however the
-benchmark ends. Without root it runs in a user namespace, where the kernel allows that.
+The servers run in one namespace, the clients in the other. A namespace ends with its last process,
+and each process here ends with its parent or its standard input, so that nothing remains, however
+the benchmark ends. Without root it runs in a user namespace, where the kernel allows that.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ CLIENTS = (
     OwnClient("websocket", "auto"),
     OwnClient("http", "jpeg"),
 )
-INSIDE = "--inside"  # then JSON: this process is in the server's namespace
-SHM = "vlagents shm"  # does not cross a network
+INSIDE = "--inside"  # argument before JSON settings: this process is in the server's namespace
+SHM = "vlagents shm"  # transports that do not cross a network
 SERVER, _CLIENT = "10.197.44.1", "10.197.44.2"
-_BULK = 64 * 2**20  # bytes, sent to measure the link
+_BULK = 64 * 2**20  # number of bytes that are sent to measure the link
 _END_S = 60.0
 _RUN_S = 900.0
 _TOOLS = ("ip", "tc", "unshare", "nsenter")
@@ -63,15 +63,15 @@ def measure_link(
     """Measure round trips over a link, and its bandwidth.
 
     Args:
-        calls: Round trips of each client.
-        rate: As `tc` takes it.
-        delay: Each way, as `tc` takes it; None adds none.
+        calls: Number of round trips of each client.
+        rate: The rate of the link, in the notation of `tc`.
+        delay: The delay in each direction, in the notation of `tc`; None adds no delay.
         peers: Names of other policy servers, as in `measure_with_peers`.
         peers_python: The Python in which they are installed.
         progress: Is called with lines of progress.
 
     Returns:
-        What `measure_with_peers` returns, and "link".
+        The result of `measure_with_peers`, and "link".
 
     Raises:
         ConfigError: This machine or user cannot make network namespaces; the message has the cure.
@@ -91,7 +91,8 @@ def measure_link(
 def run_inside(
     module: str, settings: Mapping[str, Any], progress: Callable[[str], None] = lambda _: None
 ) -> Any:
-    """Run `python -m MODULE --inside SETTINGS` in a new network namespace, that of the server.
+    """Run `python -m MODULE --inside SETTINGS` in a new network namespace, which is that of the
+    server.
 
     Args:
         module: A module that calls `answer_from_inside` if its first argument is `INSIDE`.
@@ -117,7 +118,7 @@ def run_inside(
 
 
 def _environment() -> dict[str, str]:
-    """Return the variables by which a process finds the package and this folder."""
+    """Return the environment variables with which a process finds the package and this folder."""
     ours = our_environment()["PYTHONPATH"]
     return {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), ours])}
 
@@ -148,12 +149,14 @@ def refused(reasons: Sequence[str]) -> str:
 
 
 class EmulatedLink:
-    """The client's namespace, and the shaped link to it. Made inside the server's namespace."""
+    """The client's namespace, and the shaped link to it. It is created inside the server's
+    namespace.
+    """
 
     def __init__(self, rate: str, delay: str | None) -> None:
         self._holder = LineProcess("the client's namespace", ["unshare", "--net", "cat"])
         try:
-            self._holder.request("1", 10)  # an answer means that it runs
+            self._holder.request("1", 10)  # the answer shows that the process runs
             target = f"/proc/{self._holder.pid}/ns/net"
             self.prefix = ["nsenter", f"--net={target}"]
             _run(["ip", "link", "set", "lo", "up"])
@@ -167,8 +170,8 @@ class EmulatedLink:
                 _run([*prefix, "ip", "link", "set", name, "up"])
                 for words in shaping(rate, delay):
                     _run([*prefix, "tc", "qdisc", "add", "dev", name, *words])
-            # Ray uses the address of the default route; without one it would choose an address that
-            # this namespace lacks.
+            # Ray uses the address of the default route; without this route, it would choose an
+            # address that this namespace lacks.
             _run(["ip", "route", "add", "default", "via", _CLIENT])
         except BaseException:
             self._holder.close()
@@ -201,8 +204,8 @@ class EmulatedLink:
 
 
 def shaping(rate: str, delay: str | None) -> list[list[str]]:
-    """Return the words of `tc qdisc add dev DEV …` for a link of that rate, and that delay each
-    way.
+    """Return the words of `tc qdisc add dev DEV …` for a link with this rate, and this delay in
+    each direction.
     """
     if delay is None:
         return [["root", "tbf", "rate", rate, "burst", "64kb", "latency", "50ms"]]
@@ -250,8 +253,8 @@ def _measure_inside(
 
 
 def _interrupt_with_stdin() -> None:
-    """Interrupt this process, and so end the benchmark, when its standard input ends, as its
-    parent has ended.
+    """Interrupt this process, which ends the benchmark, when its standard input ends, since its
+    parent has then ended.
     """
 
     def wait() -> None:
@@ -264,7 +267,7 @@ def _interrupt_with_stdin() -> None:
 
 def answer_from_inside(measure: Callable[..., Any], settings: str) -> None:
     """Run a benchmark in this process, which `run_inside` started. It writes lines of JSON with
-    "progress", then one with "result" or "error".
+    "progress", then a line with "result" or "error".
 
     Args:
         measure: Is called with the settings, and with `progress`, a function that takes a line.
@@ -272,7 +275,7 @@ def answer_from_inside(measure: Callable[..., Any], settings: str) -> None:
     """
     die_with_parent()
     out = own_stdout()
-    # A shell may have started all this with it ignored.
+    # A shell may have started this process with the signal ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     _interrupt_with_stdin()
 
@@ -290,9 +293,12 @@ def answer_from_inside(measure: Callable[..., Any], settings: str) -> None:
 
 def main(
     calls: Calls = 600,
-    rate: Annotated[str, typer.Option(help="Of the link, as tc writes it.")] = RATE,
+    rate: Annotated[str, typer.Option(help="Rate of the link, as tc writes it.")] = RATE,
     delay: Annotated[
-        str | None, typer.Option(help="Each way, as tc writes it: 2ms. Needs the kernel's netem.")
+        str | None,
+        typer.Option(
+            help="Delay in each direction, as tc writes it: 2ms. Needs the kernel's netem."
+        ),
     ] = None,
     peers: others.Peers = "vlagents,openpi",
     peers_python: others.PeersPython = others.PYTHON,

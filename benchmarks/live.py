@@ -1,11 +1,13 @@
-"""Cost of the live page: acts of robots with no, one and four viewers, side by side in one run.
+"""Measures the cost of the live page: calls of robots with no, one and four viewers, alternating in
+one run.
 
 One cluster serves three applications, each with one replica of a policy that takes 5 ms: one
-unchanged, one whose sender lacks the lines for the live page, and one that holds the last 30 s of
-each session. All serve the same robots: two of 50 Hz, and a saturated one that acts again at each
-answer. Robots and viewers have their own processes. The settings take turns within each round. A
-viewer shows the pictures of all sessions, and requests the next message at once, like the page. On
-a busy machine the CPU time of the replica is a better measure than acts a second.
+unchanged, one whose sender lacks the lines for the live page, and one that keeps the last 30 s of
+each session. All applications serve the same robots: two with 50 Hz, and a saturated robot that
+sends its next request at each answer. Robots and viewers have separate processes. The settings
+alternate within each round. A viewer shows the pictures of all sessions, and requests the next
+message immediately, like the page. On a busy machine the CPU time of the replica is a better
+measure than actions per second.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ HZ, SATURATED_HZ = 50.0, 1e9
 _CHUNK = 8
 _CONFIG = {"base_ms": 5.0, "action_dim": 7, "chunk": _CHUNK}
 _WARM_S = 0.5
-_LEASE_ENDS_S = LEASE_S + 1.0  # after the last viewer has gone
+_LEASE_ENDS_S = LEASE_S + 1.0  # time after which the lease of the last viewer has ended, s
 
 
 class Measured(Noop):
@@ -74,8 +76,8 @@ class Untapped(Measured):
 
 
 def _without(function: FunctionType, lines: str, instead: str) -> None:
-    """Compile a function of the sender's module again with something else in place of the only
-    lines that match.
+    """Compile a function of the sender's module again, after replacing the only lines
+    that match.
     """
     source, found_lines = re.subn(lines, instead, textwrap.dedent(inspect.getsource(function)))
     if found_lines != 1:
@@ -92,17 +94,17 @@ def _without(function: FunctionType, lines: str, instead: str) -> None:
 class Turn(NamedTuple):
     """The robots' figures for one turn of one setting."""
 
-    acts_per_s: float  # of the saturated robot
-    cpu_ms: float  # CPU time of the replica's process, for each act of any robot
+    acts_per_s: float  # actions per second of the saturated robot
+    cpu_ms: float  # CPU time of the replica's process per action of any robot, ms
     saturated_ms: list[float]
-    paced_ms: list[float]  # of those of 50 Hz
-    messages_per_s: float  # of all viewers
+    paced_ms: list[float]  # durations of the calls of the robots with 50 Hz, ms
+    messages_per_s: float  # messages per second to all viewers
     mb_per_s: float
 
 
 class Robots:
-    """The robots of one application: a process of those with a rate, and one of the saturated
-    one.
+    """The robots of one application: a process with the robots that have a rate, and a process with
+    the saturated robot.
     """
 
     def __init__(self, stack: contextlib.ExitStack, name: str, url: str, transport: str) -> None:
@@ -112,12 +114,12 @@ class Robots:
             )
             for kind, hz in (("robots", [HZ, HZ]), ("saturated robot", [SATURATED_HZ]))
         ]
-        # The id of its process.
+        # process id of the replica
         [self.replica] = {process.read(START_S) for process in self._processes}
 
     def act(self, seconds: float) -> list[list[float]]:
-        """Run all robots; returns the durations of the acts, ms, of the paced robots and of the
-        saturated one.
+        """Run all robots, and return the durations of the calls of the paced robots and of the
+        saturated robot, ms.
         """
         for process in self._processes:
             process.send(json.dumps(seconds))
@@ -131,7 +133,7 @@ def measure_live(
     transport: TransportName,
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Measure each setting once in each round, for `seconds`; returns plain JSON values."""
+    """Measure each setting once in each round, for `seconds`, and return plain JSON values."""
     turns: dict[str, list[Turn]] = {}
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
@@ -159,7 +161,7 @@ def measure_live(
         settings = [(ABSENT, "untapped", 0), (NOBODY, "tapped", 0), (RING, "holding", 0)]
         settings += [(_name(n), "tapped", n) for n in viewers]
         for number in range(rounds):
-            shift = number % len(settings)  # so that none is always first
+            shift = number % len(settings)  # rotates the settings, so that none is always first
             for name, app, looking in settings[shift:] + settings[:shift]:
                 if name == NOBODY:
                     time.sleep(_LEASE_ENDS_S)
@@ -182,8 +184,8 @@ def _name(viewers: int) -> str:
 
 
 def _base(name: str) -> str:
-    """Return the reference of a setting: the build without live page, or the same without
-    viewers.
+    """Return the setting with which a setting is compared: the build without live page, or the same
+    build without viewers.
     """
     return ABSENT if name in (ABSENT, NOBODY) else NOBODY
 
@@ -292,10 +294,12 @@ def _viewer(_: contextlib.ExitStack, watch: str) -> tuple[Callable[[float], tupl
 
 
 def main(
-    rounds: Annotated[int, typer.Option(min=1, help="Turns of each setting.")] = 8,
+    rounds: Annotated[int, typer.Option(min=1, help="Number of turns of each setting.")] = 8,
     seconds: Annotated[float, typer.Option(help="Length of a turn, s.")] = 5.0,
-    viewers: Annotated[list[int], typer.Option(help="Viewers at once, repeatable.")] = [1, 4],  # noqa: B006
-    transport: Annotated[str, typer.Option(help="Of the robots.")] = "websocket",
+    viewers: Annotated[
+        list[int], typer.Option(help="Number of simultaneous viewers; may be repeated.")
+    ] = [1, 4],  # noqa: B006
+    transport: Annotated[str, typer.Option(help="Transport of the robots.")] = "websocket",
     out_file: Out = None,
 ) -> None:
     """Measure the cost of the live page for robots, with no, one and four viewers."""

@@ -1,4 +1,4 @@
-"""The time of a policy's network alone, and what one act does on a GPU."""
+"""Measures the time of a policy's network alone, and profiles one inference call on a GPU."""
 
 from __future__ import annotations
 
@@ -12,26 +12,27 @@ from typing import Any
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
 
-Span = tuple[float, float, str]  # begin and end, µs, and the name of a kernel
+Span = tuple[float, float, str]  # begin and end, µs, and name of each kernel
 
-_SHOWN = 5  # gaps
-_CORE = "core "  # begin of the names of the profiler's records of cores
-_NAME_CHARACTERS = 90  # number of characters of a kernel
-# In torch's warning; its debug mode warns of itself in other words.
+_SHOWN = 5  # maximum number of gaps that are shown
+_CORE = "core "  # prefix of the names of the profiler's records of cores
+_NAME_CHARACTERS = 90  # maximum number of characters of a kernel's name
+# Part of torch's warning about a synchronization; warnings about the debug mode itself have other
+# words.
 _WAIT = "called a synchronizing CUDA operation"
 
 
 class NetworkTimer:
     """Times the cores of policies: with events of CUDA on a GPU, by the clock on a CPU.
 
-    What surrounds the cores does not count: images, tokens, copies to the device, results.
+    Code outside the cores does not count: images, tokens, copies to the device, results.
     """
 
     def __init__(self) -> None:
-        self._spans: list[tuple[Any, Any]] | None = None  # None unless `measure` runs
-        self._names: set[str] = set()  # names of the cores
-        self._is_annotating = False  # whether `kernels` runs
-        self._inside = False  # whether a core runs; one may call another
+        self._spans: list[tuple[Any, Any]] | None = None  # None unless `measure` is running
+        self._names: set[str] = set()  # names of the cores, if they are recorded
+        self._is_annotating = False  # whether `kernels` is running
+        self._inside = False  # whether a core is running, as a core may call another
 
     @contextmanager
     def loading(self) -> Iterator[None]:
@@ -59,8 +60,8 @@ class NetworkTimer:
             Compilation.core = mark  # type: ignore[method-assign]
 
     def measure(self, act: Callable[[], object]) -> float | None:
-        """Run an act that waits for its result; return the time of its cores, ms, or None if the
-        policy has none.
+        """Run a call that waits for its result; return the time of the policy's cores, ms, or None
+        if it has none.
         """
         self._spans = []
         try:
@@ -72,15 +73,15 @@ class NetworkTimer:
         return sum(took) if took else None
 
     def kernels(self, act: Callable[[], object], most: int = 25) -> dict[str, list[dict[str, Any]]]:
-        """Run an act under torch's profiler, and return the kernels of each core, those with the
+        """Run a call under torch's profiler, and return the kernels of each core, those with the
         longest total time first. On a machine without a GPU, operators of the CPU take their place.
 
         A core begins when the GPU has no other work, and ends with its last kernel, so that each
         kernel is within the time of its core, also those of a replayed graph.
 
         Args:
-            act: The act.
-            most: The largest number of kernels of a core.
+            act: The call.
+            most: The maximum number of kernels of a core.
 
         Returns:
             By the name of a core: "kernel", "calls", "ms", and the "share" of the time of all
@@ -95,14 +96,15 @@ class NetworkTimer:
         kind = torch.autograd.DeviceType.CUDA
         if not torch.cuda.is_available():
             kind = torch.autograd.DeviceType.CPU
-        # CUPTI repeats an annotation on the device, around its kernels.
+        # CUPTI repeats an annotation on the device, around the kernels of the annotated call.
         annotations = {f"{_CORE}{name}" for name in self._names}
         spans = [
             (event.name.removeprefix(_CORE), event.time_range)
             for event in events
             if event.name in annotations and event.device_type == torch.autograd.DeviceType.CPU
         ]
-        times_us: dict[str, dict[str, list[float]]] = {}  # of each kernel, by core and name
+        # Durations of each kernel, µs, by core and name.
+        times_us: dict[str, dict[str, list[float]]] = {}
         for event in events:
             if event.device_type != kind or event.name in annotations:
                 continue
@@ -146,8 +148,8 @@ class NetworkTimer:
 
 
 def _longest(times_us: Mapping[str, Sequence[float]], most: int) -> list[dict[str, Any]]:
-    """Return the kernels with the longest total time, as `NetworkTimer.kernels` does, from the
-    times of each call of each kernel.
+    """Return the kernels with the longest total time in the format of `NetworkTimer.kernels`, from
+    the durations of the calls of each kernel.
     """
     totals_us = Counter({name: sum(times) for name, times in times_us.items()})
     all_us = max(totals_us.total(), 1e-9)
@@ -165,7 +167,7 @@ def _longest(times_us: Mapping[str, Sequence[float]], most: int) -> list[dict[st
 
 
 def _nothing() -> None:
-    """Wait for nothing: a CPU has computed what it was asked for."""
+    """Do nothing, as a CPU computes synchronously."""
 
 
 def _now(on_gpu: bool) -> Any:
@@ -177,13 +179,13 @@ def _now(on_gpu: bool) -> Any:
 
 
 def profile(act: Callable[[], object]) -> dict[str, Any]:
-    """Run an act under torch's profiler; on a machine without a GPU, operators of the CPU take the
+    """Run a call under torch's profiler; on a machine without a GPU, operators of the CPU take the
     place of kernels.
 
     Returns:
         "launches": calls that start a kernel or a graph; "kernels"; "busy_ms": the time in which at
-        least one kernel ran; "gaps": the longest times without one, "MS ms before KERNEL", which
-        the profiler itself lengthens.
+        least one kernel ran; "gaps": the longest times without a kernel, "MS ms before KERNEL",
+        which the profiler itself lengthens.
     """
     torch = require("torch")
     on_gpu = torch.cuda.is_available()
@@ -204,7 +206,7 @@ def profile(act: Callable[[], object]) -> dict[str, Any]:
 
 
 def _profiled(act: Callable[[], object]) -> Sequence[Any]:
-    """Run an act under torch's profiler, and return its events."""
+    """Run a call under torch's profiler, and return the profiler's events."""
     torch = require("torch")
     kinds = torch.profiler.ProfilerActivity
     activities = [kinds.CPU, *([kinds.CUDA] if torch.cuda.is_available() else [])]
@@ -228,8 +230,8 @@ def busy_time(spans: Sequence[Span]) -> tuple[float, list[tuple[float, str]]]:
 
 
 def waits(act: Callable[[], object]) -> Counter[str]:
-    """Run an act, and count the places, FILE:LINE, at which the CPU waits for the GPU; none
-    without a GPU.
+    """Run a call, and count how often the CPU waits for the GPU at each place, FILE:LINE; there are
+    none without a GPU.
     """
     torch = require("torch")
     with warnings.catch_warnings(record=True) as said:

@@ -1,10 +1,11 @@
-"""Overhead of an evaluation over the bare environments: steps a second, in alternating rounds.
+"""Measures the overhead of an evaluation over the bare environments: steps per second, in
+alternating rounds.
 
 A bare round steps the environments in as many processes as the evaluation has workers, with zeros
 as actions and no policy, server or Ray. An evaluated round runs the same episodes with a served
 `noop` policy. Both count the steps made while all workers were running, with the gaps between
 episodes, but without the creation of environments and the wait for the first and the last worker.
-CPU time is that of the same span: of all bare processes, or of all processes of the evaluation
+CPU time is counted in the same span: of all bare processes, or of all processes of the evaluation
 (driver, workers, replica, HAProxy and Ray's daemons).
 """
 
@@ -42,11 +43,11 @@ from vlagents_ray.serve.launch.server import running_server
 
 _START_S = 600.0
 _EVERY_S = 0.2
-_LOOK_EVERY = 5  # samples between two searches for processes
+_LOOK_EVERY = 5  # number of samples between two searches for processes
 
 
 class Span(NamedTuple):
-    """One episode: its begin and end, s, and its steps."""
+    """One episode: the times of its beginning and end, s, and its number of steps."""
 
     begun: float
     ended: float
@@ -61,7 +62,9 @@ class CallRate(NamedTuple):
 
 
 class Steady(NamedTuple):
-    """The span in which all workers play: s of `time.time()`, and the steps of all in it."""
+    """The span in which all workers run episodes, s of `time.time()`, and the number of all steps
+    in it.
+    """
 
     first: float
     last: float
@@ -69,7 +72,7 @@ class Steady(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """The steps a second."""
+        """The steps per second."""
         return self.steps / (self.last - self.first)
 
 
@@ -84,7 +87,7 @@ class Overhead:
 
     @property
     def ratios(self) -> tuple[float, ...]:
-        """The ratios of evaluated to bare, by round."""
+        """The ratio of the evaluated rate to the bare rate, by round."""
         return tuple(
             e.steps_per_s / b.steps_per_s for e, b in zip(self.evaluated, self.bare, strict=True)
         )
@@ -126,7 +129,7 @@ def measure_overhead(
     env_options: Mapping[str, Any] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Overhead:
-    """Alternate bare and evaluated rounds of `episodes` episodes for each worker."""
+    """Alternate bare and evaluated rounds with `episodes` episodes for each worker."""
     options = dict(env_options or {})
     with make_env(env, **options) as one:
         action_dim = one.contract.action.dim or 1
@@ -145,7 +148,8 @@ def measure_overhead(
                 video="none",
                 out=Path(folder) / str(number),
             )
-            with CpuSampler(lambda: marked(os.environ[MARK])) as cpu:  # the cluster's own mark
+            # The name that the cluster's processes have in their environment.
+            with CpuSampler(lambda: marked(os.environ[MARK])) as cpu:
                 evaluate(config)
             playing = steady(recorded(config.out), workers)
             evaluated.append(
@@ -160,14 +164,14 @@ def measure_overhead(
 
 
 def steady(episodes: Sequence[Span], workers: int) -> Steady:
-    """Find the span between the first and the last moment at which all `workers` play.
+    """Find the span between the first and the last moment at which all `workers` run episodes.
 
-    The steps of an episode are assumed to be spread evenly. Raises `EnvFailed` if the workers never
-    all play.
+    The steps of an episode are assumed to be evenly spread. Raises `EnvFailed` if the workers never
+    all run episodes.
     """
     edges = sorted([(e.begun, 1) for e in episodes] + [(e.ended, -1) for e in episodes])
     playing = 0
-    full: list[float] = []  # moments at which all workers begin to play, or no longer all play
+    full: list[float] = []  # times at which all workers begin to run, or no longer all run
     for moment, change in edges:
         if workers in (playing, playing + change):
             full.append(moment)
@@ -185,7 +189,7 @@ def steady(episodes: Sequence[Span], workers: int) -> Steady:
 def bare_rate(
     env: str, options: Mapping[str, Any], action_dim: int, workers: int, episodes: int
 ) -> CallRate:
-    """Play `episodes` episodes of zeros in each of `workers` processes."""
+    """Run `episodes` episodes with zeros as actions in each of `workers` processes."""
     context = multiprocessing.get_context("spawn")
     start = context.Barrier(workers)
     results = context.Queue()
@@ -247,7 +251,8 @@ def recorded(out: Path) -> list[Span]:
 
 
 class CpuSampler:
-    """Samples the CPU time of this process and of those that `processes` returns, within a context.
+    """Samples the CPU time of this process and of the processes that `processes` returns, within a
+    context.
 
     An ended process counts with its last sample. The time for sampling itself is not counted.
     """
@@ -255,7 +260,7 @@ class CpuSampler:
     def __init__(self, processes: Callable[[], Iterable[int]]) -> None:
         self._processes = processes
         self._seen: dict[int, float] = {}
-        self._moments: list[tuple[float, float]] = []  # s of time.time(), CPU s
+        self._moments: list[tuple[float, float]] = []  # samples: s of time.time(), and CPU s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._sample, name="cpu", daemon=True)
 
@@ -268,7 +273,7 @@ class CpuSampler:
         self._thread.join()
 
     def between(self, first: float, last: float) -> float:
-        """Interpolate the CPU time used between two moments, s of `time.time()`."""
+        """Interpolate the CPU time that was used between two times, s of `time.time()`."""
         moments, totals = zip(*self._moments, strict=True)
         return float(np.interp(last, moments, totals) - np.interp(first, moments, totals))
 
@@ -314,12 +319,14 @@ def show_overhead(found: Overhead) -> None:
 def main(
     env: Annotated[str, typer.Argument(help="The environment to step.")] = "tabletop",
     workers: Annotated[int, typer.Option(min=1)] = 2,
-    episodes: Annotated[int, typer.Option(min=1, help="For each worker and round.")] = 8,
+    episodes: Annotated[
+        int, typer.Option(min=1, help="Number of episodes for each worker and round.")
+    ] = 8,
     rounds: Annotated[int, typer.Option(min=1)] = 3,
     out_file: Out = None,
     env_set: Annotated[list[str], typer.Option("--env-set", metavar="KEY=VALUE")] = [],  # noqa: B006
 ) -> None:
-    """Measure steps a second, and CPU time a step, of an evaluation against the bare
+    """Measure steps per second, and CPU time per step, of an evaluation and of the bare
     environments.
     """
     with errors():

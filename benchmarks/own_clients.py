@@ -36,8 +36,8 @@ ROBOT, SIMULATION = "robot", "simulation"
 
 @functools.cache
 def observation(size: int = 224, cameras: int = 2) -> Obs:
-    """Return the observation that every server in a benchmark gets, ours or a peer's, byte for
-    byte.
+    """Return the observation that every server in a benchmark receives, ours and others, with
+    identical bytes.
 
     It has camera images with smooth structure and some noise, like photographs, seven joints and a
     gripper. Each call returns the same object, which must not be changed.
@@ -57,7 +57,9 @@ def observation(size: int = 224, cameras: int = 2) -> Obs:
 
 
 def save_observation(obs: Obs, path: Path) -> None:
-    """Save an .npz for a peer's client: every camera by its name, `joints`, `gripper`."""
+    """Save an .npz file for the client of another system: every camera by its name, `joints`,
+    `gripper`.
+    """
     if obs.gripper is None:
         raise ValueError("the observation of a benchmark has a gripper")
     np.savez(path, gripper=np.float64(obs.gripper), joints=obs.state["joints"], **obs.cameras)  # type: ignore[arg-type]
@@ -65,11 +67,11 @@ def save_observation(obs: Obs, path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class OwnClient:
-    """A client of ours, by its transport. `codec` is as in `connect`."""
+    """A client of ours, described by its transport. `codec` is as in `connect`."""
 
     transport: str
     codec: str = "raw"
-    actor: bool = False  # in a Ray actor, by serve://
+    actor: bool = False  # whether the client is in a Ray actor, over serve://
 
     @property
     def name(self) -> str:
@@ -92,8 +94,8 @@ OWN_CLIENTS = (
 
 
 def own_clients(only: Sequence[str] = ()) -> tuple[list[OwnClient], dict[str, str]]:
-    """Return the clients of this version, or those with a transport in `only`, and the reasons
-    for skipped ones.
+    """Return the clients of this version, or those with a transport in `only`, and the reasons for
+    skipped clients.
     """
     known = get_args(TransportName)
     wanted = [one for one in OWN_CLIENTS if not only or one.transport in only]
@@ -109,7 +111,7 @@ def own_clients(only: Sequence[str] = ()) -> tuple[list[OwnClient], dict[str, st
 
 
 def connect(url: str, transport: str, codec: str, priority: str | None = None) -> RemoteAgent:
-    """Make an agent that has not connected yet.
+    """Return an agent that has not connected yet.
 
     `codec` is "auto", "raw", "jpeg", or "jpeg QUALITY SUBSAMPLING". `priority` is "robot" or
     "simulation", and has no effect if `RemoteAgent` has no priorities.
@@ -141,7 +143,7 @@ class BenchCaller:
         return timed(lambda: self._obs, self._agent.act, calls)
 
     def ready(self) -> dict[str, Any]:
-        """Warm up; returns the client's description."""
+        """Warm up, and return the client's description."""
         self.measure(WARM_UP)
         return self.description
 
@@ -150,7 +152,7 @@ class BenchCaller:
 
 
 class LoadGenerator:
-    """Clients of one process that make load: robots, and after them simulations."""
+    """Clients of one process that make load: first robots, then simulations."""
 
     def __init__(self, url: str, transport: str, codec: str, robots: int, simulations: int) -> None:
         self._obs = observation()
@@ -163,7 +165,7 @@ class LoadGenerator:
         )
 
     def ready(self) -> bool:
-        """Answer an actor's caller once `__init__` is done."""
+        """Return once `__init__` of an actor is done."""
         return True
 
     def run(self, **wanted: Any) -> list[list[Call]]:
@@ -182,10 +184,10 @@ class LoadGenerator:
 
 @dataclass(slots=True)
 class ActorDriver:
-    """A client in a Ray actor, as rollouts are."""
+    """A client in a Ray actor, like the clients of rollouts."""
 
     actor: Any
-    pid: int = 0  # process id of the actor's process, once it is ready
+    pid: int = 0  # process id of the actor, once it is ready
     server_pid: int | None = None
 
     def ready(self) -> dict[str, Any]:
@@ -206,7 +208,7 @@ class ActorDriver:
 def connected(
     client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()
 ) -> Iterator[ProcessDriver]:
-    """Start a client of ours to the server at `url`; its command begins with `prefix`."""
+    """Start a client of ours to the server at `url`; `prefix` precedes the client's command."""
     if client.actor:
         import ray
 
@@ -216,7 +218,7 @@ def connected(
         try:
             yield ActorDriver(actor)
         finally:
-            # `ready` has raised the reason if it never connected.
+            # If the client never connected, `ready` has raised the reason.
             with contextlib.suppress(ray.exceptions.RayError):
                 ray.get(actor.close.remote(), timeout=CALL_S)
             ray.kill(actor)

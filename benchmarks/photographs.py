@@ -1,5 +1,5 @@
-"""Images like photographs, for measurements of what cameras send: JPEG codes random noise in four
-times the bytes and twice the time.
+"""Images like photographs, for realistic measurements of camera images: with random noise, JPEG
+needs four times the bytes and twice the time.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from vlagents_ray.interface import Obs
 
 
 def photograph(height: int = 224, width: int = 224, seed: int = 0) -> np.ndarray:
-    """Return an image with detail that falls with its frequency, a shaded disc, and noise that
-    neighbours share, as after demosaicing; (H, W, 3) uint8.
+    """Return an image, (H, W, 3) uint8, with detail that decreases with frequency, a shaded disc,
+    and noise that neighbours share, as after demosaicing.
     """
     rng = np.random.default_rng(seed)
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
@@ -41,7 +41,7 @@ def photograph(height: int = 224, width: int = 224, seed: int = 0) -> np.ndarray
     return pixels
 
 
-# The same robots are often made again; a photograph of 224 px takes about 10 ms.
+# The same robots are often created again, and a photograph of 224 px takes about 10 ms.
 _photograph = lru_cache(maxsize=1024)(photograph)
 
 
@@ -50,7 +50,7 @@ def with_photographs(obs: Obs, seed: int) -> Obs:
 
     Args:
         obs: The observation.
-        seed: The seed; other ones give other photographs.
+        seed: The seed of the photographs.
     """
     cameras = {}
     for number, (name, image) in enumerate(obs.cameras.items()):

@@ -21,7 +21,8 @@ from vlagents_ray.cli.console import errors, out
 from vlagents_ray.registry import require
 
 ROOT = Path(__file__).parents[1]
-# Name, colour on a light background, colour on a dark one: those of the report.
+# Name, colour on a light background, and colour on a dark background; the colours are those of the
+# report.
 _COLOURS = {
     "paper": ("#ffffff", "#12161b"),
     "ink": ("#1b1f24", "#e8ebef"),
@@ -37,11 +38,12 @@ PAPER, INK, SOFT, RULE, *SERIES = (light for light, _ in _COLOURS.values())
 OURS = SERIES[0]
 _FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif"
 _MATPLOTLIB_FONTS = re.compile(r"'DejaVu Sans', 'Bitstream[^;\"]*sans-serif")
-WIDTH = 6.8  # inches: 653 px, about the width of a page's text, so that text keeps its size
+# Width in inches: 653 px, about the width of a page's text, so that text keeps its size.
+WIDTH = 6.8
 _SETTINGS = {
     "svg.fonttype": "none",
     "svg.hashsalt": "vlagents_ray",
-    "font.size": 9.5,  # 12.7 px
+    "font.size": 9.5,  # size of text in points, 12.7 px
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
@@ -59,7 +61,7 @@ _SETTINGS = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
-_ROUND_TRIPS_MS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)  # ticks
+_ROUND_TRIPS_MS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)  # ticks of the axis
 _NAMES = {
     "shm": "shared memory",
     "websocket": "WebSocket",
@@ -87,7 +89,7 @@ def new_figure(height: float) -> Iterator[Any]:
 
 
 def save_figure(figure: Any, file: Path) -> None:
-    """Write a figure; one in SVG has its colours by the reader's scheme."""
+    """Write a figure; the colours of an SVG follow the reader's scheme."""
     if file.suffix != ".svg":
         figure.savefig(file, dpi=150)
         return
@@ -107,7 +109,7 @@ def save_figure(figure: Any, file: Path) -> None:
 
 
 def name_of(way: str) -> str:
-    """Return the name of a transport or of another system as readers know it."""
+    """Return the reader's name for a transport or another system."""
     return ", ".join(_NAMES.get(part, part) for part in way.split(", "))
 
 
@@ -167,7 +169,7 @@ def plot_throughput(results: Mapping[str, Any], file: Path) -> None:
 
 
 def _last(row: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the point of the most clients."""
+    """Return the point with the most clients."""
     point: Mapping[str, Any] = row["curve"][-1]
     return point
 
@@ -183,7 +185,7 @@ def _plot_rate(axes: Any, point: Mapping[str, Any], row: int, colour: str) -> No
 
 
 def _workload(part: Mapping[str, Any]) -> str:
-    """Return the title of a panel of throughput: how long a batch takes."""
+    """Return the title of a panel of throughput, which contains the duration of a batch."""
     base_ms, row_ms = part["config"].get("base_ms", 0), part["config"].get("per_item_ms", 0)
     base = f"{base_ms:g} ms + " if base_ms else ""
     largest = f"batches of {part['batch']}" if part["batch"] > 1 else "no batching"
@@ -191,7 +193,7 @@ def _workload(part: Mapping[str, Any]) -> str:
 
 
 def _name_rows(axes: Any, ways: Sequence[str], peers: set[str]) -> None:
-    """Name the rows of a dot plot, those of this project in its colour."""
+    """Label the rows of a dot plot; the rows of this project have its colour."""
     axes.set_yticks(range(len(ways)), [name_of(way) for way in ways])
     for way, label in zip(ways, axes.get_yticklabels(), strict=True):
         label.set_color(INK if way in peers else OURS)
@@ -202,7 +204,7 @@ def _name_rows(axes: Any, ways: Sequence[str], peers: set[str]) -> None:
 
 
 def _explain_colours(axes: Any) -> None:
-    """Say in the empty corner of a dot plot whose dots have which colour."""
+    """Explain the colours of the dots in the empty corner of a dot plot."""
     for height, (text, colour) in enumerate((("other systems", SOFT), ("vlagents_ray", OURS))):
         axes.annotate(
             f"● {text}",
@@ -237,8 +239,8 @@ def plot_fleets(fleets: Sequence[Mapping[str, Any]], file: Path) -> None:
     """Draw the share of the ticks in time by number of robots, a panel for each fleet.
 
     Args:
-        fleets: For each its "title", the "points" of `benchmarks.fleet.measure_fleet`, and "most",
-            the largest number of robots by arithmetic, or None.
+        fleets: For each fleet its "title", the "points" of `benchmarks.fleet.measure_fleet`, and
+            "most", the largest number of robots that is possible by arithmetic, or None.
         file: The picture.
     """
     points = itertools.chain.from_iterable(fleet["points"] for fleet in fleets)
@@ -250,7 +252,7 @@ def plot_fleets(fleets: Sequence[Mapping[str, Any]], file: Path) -> None:
         for axes, fleet in zip(panels, fleets, strict=True):
             _plot_shares(axes, fleet, colours)
             robots, _, server = fleet["title"].partition("\n")
-            # What all panels have in common is below them.
+            # Labels that all panels share are below the panels.
             axes.set_title(robots if len(servers) == 1 else f"{robots}\n{server}")
             axes.set_ylabel("ticks in time, %")
         common = f" ({servers.pop()})" if len(servers) == 1 else ""
@@ -281,12 +283,14 @@ def _plot_shares(axes: Any, fleet: Mapping[str, Any], colours: Mapping[str, str]
         axes.annotate(text, (0.03, 0.08), xycoords="axes fraction", color=SOFT)
     heights = _spread([share for _, share, _, _ in ends], least=13)
     for (robots, share, system, colour), height in zip(ends, heights, strict=True):
-        # A percent of this axis is about 1.2 points of the text high.
+        # One percent of this axis is about 1.2 points of text high.
         _label(axes, name_of(system), (robots, share), (8, 1.2 * (height - share)), colour)
 
 
 def _spread(values: Sequence[float], least: float) -> list[float]:
-    """Return heights for labels of values, at least `least` apart, the highest unchanged."""
+    """Return heights for the labels of values that are at least `least` apart; the highest label
+    stays at its value.
+    """
     heights = list(values)
     order = sorted(range(len(values)), key=lambda index: -values[index])
     for above, below in itertools.pairwise(order):
@@ -298,7 +302,7 @@ def plot_learners(points: Sequence[Mapping[str, Any]], before: float, file: Path
     """Draw a dot for the success of each run, a row for each learner.
 
     Args:
-        points: For each run its "learner", "success" in [0, 1], "episodes", and "cpu_s" or None.
+        points: For each run: "learner", "success" in [0, 1], "episodes", and "cpu_s" or None.
         before: The success of the policy that all learners begin with.
         file: The picture.
     """
@@ -326,7 +330,7 @@ def plot_learners(points: Sequence[Mapping[str, Any]], before: float, file: Path
 
 
 def _with_costs(learner: str, runs: Sequence[Mapping[str, Any]]) -> str:
-    """Return the name of a learner above the mean costs of its runs."""
+    """Return a label with the name of a learner, followed by the mean costs of its runs."""
     episodes = sum(run["episodes"] for run in runs) / len(runs)
     costs = f"{episodes:,.0f} episodes"
     measured = [run["cpu_s"] for run in runs if run["cpu_s"] is not None]
@@ -337,7 +341,7 @@ def _with_costs(learner: str, runs: Sequence[Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Draw all pictures of the docs from the results in the repository."""
-    # These modules draw their own results with this one.
+    # These modules use this module to draw their results.
     from benchmarks.autoscaling import plot_autoscaling
     from benchmarks.learners_page import points_of, rate_of
 

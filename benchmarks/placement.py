@@ -1,8 +1,8 @@
-"""Robots of two kinds on several replicas, in virtual time: their sessions placed and moved by what
-the robots need, and by the number of sessions.
+"""Simulates robots of two kinds on several replicas in virtual time.
 
-Robots with long chunks need a tenth of what others need that have short ones. If they come in
-random order, replicas with equal numbers of sessions have unequal loads.
+Their sessions are placed and moved according to the needs of the robots, or according to the number
+of sessions. Robots with long chunks need a tenth of the capacity of robots with short chunks. If
+robots come in random order, replicas with equal numbers of sessions have unequal loads.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vlagents_ray.serve.fleet import CostCurve, RobotNeed
 from vlagents_ray_fleet.simulation import Behaviour, Tally, World, starved_streams
 
 MODEL = "pi0"
-PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled: s
+PI0 = CostCurve(0.0293, 0.00806)  # costs of pi0 on an H200, compiled, s
 LARGEST_BATCH = 16
 TRANSPORT_S = 0.005
 LONG, SHORT = RobotNeed(hz=10.0, rows=50), RobotNeed(hz=10.0, rows=8)
@@ -32,17 +32,17 @@ class PlacementPlan:
     """The robots and the replicas."""
 
     replicas: int = 8
-    robots: int = 36  # robots of each kind, for each replica: a load of 0.86
+    robots: int = 36  # number of robots of each kind per replica, which is a load of 0.86
     begin_within_s: float = 60.0
     seconds: float = 120.0
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """What the robots got."""
+    """The results of the robots."""
 
-    share: float  # share of their ticks in time
-    robots_in_time: int  # with at least 98 % of their ticks in time
+    share: float  # share of the robots' ticks in time
+    robots_in_time: int  # number of robots with at least 98 % of their ticks in time
     robots: int
     largest_load: float  # largest load of a replica at the end, as a multiple of the mean load
     moves: int
@@ -53,8 +53,9 @@ def place(plan: PlacementPlan, seed: int, *, weighs_robots: bool) -> Placement:
 
     Args:
         plan: The robots and the replicas.
-        seed: Of all random numbers.
-        weighs_robots: Whether replicas compare what their robots need, else their sessions.
+        seed: The seed of all random numbers.
+        weighs_robots: Whether replicas compare the needs of their robots; otherwise they compare
+            their numbers of sessions.
     """
     draw = random.Random(seed)
     world = World(seed, Behaviour(weighs_robots=weighs_robots), TRANSPORT_S)
@@ -94,11 +95,15 @@ def mean_placement(placements: Sequence[Placement]) -> dict[str, float]:
 
 def main(
     replicas: Annotated[int, typer.Option(min=2)] = 8,
-    robots: Annotated[int, typer.Option(min=1, help="Of each kind, for each replica.")] = 36,
+    robots: Annotated[
+        int, typer.Option(min=1, help="Number of robots of each kind for each replica.")
+    ] = 36,
     seeds: Annotated[int, typer.Option(min=1)] = 3,
     out_file: Out = None,
 ) -> None:
-    """Print what the robots get if sessions are placed by their needs, and by their number."""
+    """Print the results if sessions are placed according to the robots' needs, and according to the
+    number of sessions.
+    """
     with errors():
         plan = PlacementPlan(replicas, robots)
         rows = table("placed by", "ticks in time", "robots with 98 %", "largest load", "moves")

@@ -1,10 +1,10 @@
-"""The speed of a policy on this machine by batch size, without Ray: bare, and behind a replica's
-batch queue.
+"""Measures the speed of a policy on this machine by batch size, without Ray: bare, and behind a
+replica's batch queue.
 
-Bare is `act_batch` on full batches, one after another. Behind the queue, as many sessions as the
-batch has rows act again at each answer. The network alone is the part of the bare time in the
-model's cores, and GPU busy is the part in which the GPU runs any kernel. The policy is loaded once
-for all.
+"Bare" calls `act_batch` with full batches, one after another. Behind the queue there are as many
+sessions as the batch has rows, and each sends its next request at each answer. "Network alone" is
+the part of the bare time in the model's cores, and "GPU busy" is the part in which the GPU runs any
+kernel. The policy is loaded only once.
 """
 
 from __future__ import annotations
@@ -55,16 +55,16 @@ class PolicyPlan:
 
     args: ServerArgs  # arguments of a deployment file
     batches: Sequence[int] = (1, 8)
-    seconds: float = 2.0  # seconds of each measurement
-    rounds: int = 3  # in which all measurements take turns
-    side: int = 224  # px, of images if the policy takes any size
-    # Sizes of the parts of the state that the policy leaves open.
+    seconds: float = 2.0  # duration of each measurement, s
+    rounds: int = 3  # number of rounds, in which all measurements alternate
+    side: int = 224  # size of images if the policy accepts any size, px
+    # Sizes of the parts of the state for which the policy has no size.
     dims: Mapping[str, int] = field(default_factory=dict)
 
 
 class BareAndQueued(MeasuredPolicy):
-    """A policy that is also measured without the queue, and of which the network is measured
-    alone.
+    """A policy that is also measured without the queue, and whose network is also
+    measured alone.
     """
 
     def __enter__(self) -> Self:
@@ -73,11 +73,11 @@ class BareAndQueued(MeasuredPolicy):
             return super().__enter__()
 
     def bare(self, size: int, seconds: float) -> dict[str, float]:
-        """Measure `act_batch` on full batches of that size, one after another, without the queue.
+        """Measure `act_batch` with full batches of this size, one after another, without the queue.
 
         Returns:
-            "actions_per_s"; "batch_ms"; "network_ms": the time of the model's cores, 0 of a policy
-            without any.
+            "actions_per_s"; "batch_ms"; "network_ms": the time of the model's cores, 0 for a policy
+            without cores.
         """
         batch = self.batch(range(size))
         times: list[float] = []
@@ -94,7 +94,9 @@ class BareAndQueued(MeasuredPolicy):
         }
 
     def kernels(self, size: int) -> dict[str, list[dict[str, Any]]]:
-        """Return the longest kernels of each of the model's cores, in an act of that size."""
+        """Return the longest kernels of each of the model's cores in a call with this batch
+        size.
+        """
         batch = self.batch(range(size))
         batch()
         return self._network.kernels(batch)
@@ -103,7 +105,7 @@ class BareAndQueued(MeasuredPolicy):
 def measure_policy(
     plan: PolicyPlan, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Measure the plan; returns plain JSON values: actions a second, ms, MiB."""
+    """Measure the plan, and return plain JSON values: actions per second, ms, MiB."""
     batch = plan.args.batch
     if batch.sizes is not None and max(plan.batches) > batch.sizes[-1]:
         raise ConfigError(
@@ -155,15 +157,15 @@ class _SizedRow:
     bare: list[dict[str, float]] = field(default_factory=list)
     queued: list[QueuedTurn] = field(default_factory=list)
     memory: list[float] = field(default_factory=list)
-    busy_ms: float | None = None  # time of a batch in which the GPU ran a kernel
+    busy_ms: float | None = None  # time of a batch in which the GPU ran a kernel, ms
 
     def to_json(self) -> dict[str, Any]:
         """Return the medians of the rounds, the 99th percentile of all their round trips, and the
         rounds.
 
-        `queued_share` is the median of the rounds' actions a second behind the queue, divided by
-        those without it, and `network_share` that of those of the network alone. `gpu_busy` is the
-        share of the bare time.
+        `queued_share` is the median over rounds of the actions per second behind the queue divided
+        by those without the queue; `network_share` is the same ratio relative to the network alone.
+        `gpu_busy` is the GPU's busy share of the bare time.
         """
         queued = [_figures(turn) for turn in self.queued]
         shares = [
@@ -203,12 +205,17 @@ def _medians(rounds: list[dict[str, float]]) -> dict[str, float]:
 
 def main(
     file: Annotated[str, typer.Argument(help="A deployment file, or a registered policy.")],
-    batch: Annotated[str, typer.Option(help="Batch sizes, with commas between them.")] = "1,8",
+    batch: Annotated[str, typer.Option(help="Batch sizes, separated by commas.")] = "1,8",
     seconds: Seconds = 2.0,
     rounds: Rounds = 3,
-    app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
+    app: Annotated[
+        str | None, typer.Option(help="Application of the file, if it contains several.")
+    ] = None,
     image: Annotated[
-        int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")
+        int,
+        typer.Option(
+            min=1, help="Width and height of images in pixels, if the policy accepts any size."
+        ),
     ] = 224,
     state: StateDims = [],  # noqa: B006
     settings: Set = [],  # noqa: B006
@@ -216,10 +223,10 @@ def main(
     config_dir: ConfigDir = None,
     out_file: Out = None,
 ) -> None:
-    """Measure actions a second of one policy by batch size, bare and behind its batch queue,
+    """Measure actions per second of one policy by batch size, bare and behind its batch queue,
     without Ray.
     """
-    # Imports Ray, for the file's schema.
+    # This imports Ray, for the schema of the file.
     from vlagents_ray.serve.launch.deployment_file import policy_application
 
     with errors():

@@ -1,4 +1,4 @@
-"""CPU time and context switches of other processes, from Linux's clocks and /proc."""
+"""Measures CPU time and context switches of other processes, with Linux's clocks and /proc."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from typing import Any
 
 import numpy as np
 
-# Ray's processes that do nothing for an act: `program` of each, some before they have set their
-# title.
+# Values of `program` for Ray's processes that do nothing for a call, some before they have set
+# their title.
 DAEMONS = frozenset(
     {"gcs_server", "raylet", "ServeController", "DashboardAgent", "RuntimeEnvAgent", "IDLE"}
     | {"default_worker.py", "dashboard.py", "agent.py", "main.py", "monitor.py", "log_monitor.py"}
 )
 _IDLE_S = 3.0
-# Cores that an idle process uses if it polls; one that waits for events or a timer uses less
-# than 0.02.
+# Minimum number of cores that an idle process uses if it polls; a process that waits for events or
+# a timer uses less than 0.02.
 _POLLING_CORES = 0.25
-_SWITCHES = re.compile(r"ctxt_switches:\t(\d+)")  # voluntary ones, then involuntary ones
+_SWITCHES = re.compile(r"ctxt_switches:\t(\d+)")  # voluntary switches, then involuntary switches
 
 
 def cpu_seconds(pid: int) -> float:
-    """Return the user and system CPU time of a process so far, all its threads, s.
+    """Return the user and system CPU time that all threads of a process have used so far, s.
 
     Raises:
-        ProcessLookupError: It has ended.
+        ProcessLookupError: The process has ended.
     """
     try:
-        # Its CPU clock (clock_getcpuclockid(3)) counts ns; /proc/PID/stat counts ticks of 10 ms,
-        # which is 100 acts.
+        # The process's CPU clock (clock_getcpuclockid(3)) counts ns; /proc/PID/stat counts ticks of
+        # 10 ms, which is as long as 100 calls.
         return time.clock_gettime((~pid << 3) | 2)
     except OSError as error:
         raise ProcessLookupError(f"/proc/{pid}: there is no such process") from error
@@ -52,10 +52,10 @@ def program(pid: int) -> str:
 
 
 def descendants(pid: int) -> set[int]:
-    """Return the processes that `pid` and its descendants have started, and that still run."""
+    """Return the running processes that `pid` and its descendants have started."""
     children: dict[int, list[int]] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):  # it has ended
+        with contextlib.suppress(OSError):  # the process has ended
             children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(
                 int(stat.parent.name)
             )
@@ -68,7 +68,8 @@ def descendants(pid: int) -> set[int]:
 
 
 def server_processes(root: int, others: Collection[int] = ()) -> list[int]:
-    """Return the processes of a server that `root` has started: all that may work for an act.
+    """Return the processes of a server that `root` has started: all processes that may work for a
+    call.
 
     Args:
         root: The process that started the server.
@@ -80,16 +81,16 @@ def server_processes(root: int, others: Collection[int] = ()) -> list[int]:
 
 
 class UsageMeter:
-    """Adds up the CPU time and the context switches of processes in spans of time, beyond their
-    use while idle.
+    """Adds up the CPU time and the context switches of processes in spans of time, in excess of
+    their idle use.
     """
 
     def __init__(self, pids: Sequence[int]) -> None:
         self._pids = pids
         self._programs = [program(pid) for pid in pids]
-        self._seconds = 0.0  # length of all spans
+        self._seconds = 0.0  # total length of all spans, s
         self._used = np.zeros((len(pids), 3))  # CPU s, voluntary and involuntary context switches
-        self._idle = np.zeros((len(pids), 3))  # the same for each second
+        self._idle = np.zeros((len(pids), 3))  # idle use per second, in the same units
 
     @contextlib.contextmanager
     def counting(self) -> Iterator[None]:
@@ -104,10 +105,10 @@ class UsageMeter:
         self._seconds += time.monotonic() - begun
 
     def mark_idle(self) -> float:
-        """Take what was counted so far as the use while idle; returns its CPU s in a second.
+        """Use the counts so far as the idle use, and return its CPU seconds per second.
 
-        What a process that polls uses is all counted: polling takes a core that no act beside it
-        could have.
+        The use of a polling process counts completely, as no other call could use the core on which
+        it polls.
         """
         idle = self._used / self._seconds
         self._seconds, self._used = 0.0, np.zeros_like(self._used)
@@ -115,8 +116,8 @@ class UsageMeter:
         return float(idle[:, 0].sum())
 
     def per_act(self, acts: int) -> dict[str, Any]:
-        """Return the use for each of `acts` acts as JSON values, and its CPU time by program,
-        ms.
+        """Return the use per call as JSON values, given the number of calls `acts`, and the CPU
+        time by program, ms.
         """
         each = (self._used - self._seconds * self._idle) / acts * (1e3, 1, 1)
         programs = dict.fromkeys(self._programs, 0.0)
@@ -125,15 +126,15 @@ class UsageMeter:
         cpu_ms, voluntary, involuntary = map(float, each.sum(axis=0))
         return {
             "cpu_ms": cpu_ms,
-            "voluntary_switches": voluntary,  # a thread waited
+            "voluntary_switches": voluntary,  # a thread has waited
             "involuntary_switches": involuntary,  # the machine had other work
             "programs": programs,
         }
 
 
 def count_idle(meters: Sequence[UsageMeter]) -> list[float]:
-    """Count for 3 s while all processes are idle, as their use while idle; returns the CPU s a
-    second of each meter.
+    """Count for 3 s while all processes are idle, and use the counts as the idle use; return the
+    CPU seconds per second of each meter.
     """
     with contextlib.ExitStack() as stack:
         for meter in meters:
@@ -143,13 +144,13 @@ def count_idle(meters: Sequence[UsageMeter]) -> list[float]:
 
 
 def _counters(pid: int) -> tuple[float, dict[str, tuple[int, ...]]] | None:
-    """Return CPU s, and the voluntary and involuntary context switches of each thread; None if
-    it has ended.
+    """Return CPU s, and the voluntary and involuntary context switches of each thread; None if the
+    process has ended.
     """
     switches: dict[str, tuple[int, ...]] = {}
     try:
         for thread in Path(f"/proc/{pid}/task").iterdir():
-            with contextlib.suppress(OSError):  # it has ended
+            with contextlib.suppress(OSError):  # the process has ended
                 switches[thread.name] = tuple(
                     map(int, _SWITCHES.findall((thread / "status").read_text()))
                 )

@@ -1,4 +1,6 @@
-"""Cost of a push of weights during acts: its seconds, the longest act, and the node's memory."""
+"""Measures the cost of a push of weights while sessions act: the duration, the longest call, and
+the node's memory.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,8 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray_learn import Publisher
 
-_LAYER = 1_000_000  # parameters
-_MOMENTS = 0.05  # s between two samples of the memory
+_LAYER = 1_000_000  # number of parameters of a layer
+_MOMENTS = 0.05  # time between two samples of the memory, s
 
 
 class TrainedConfig(BaseModel, extra="forbid"):
@@ -37,7 +39,7 @@ class TrainedConfig(BaseModel, extra="forbid"):
 
 
 class Trained(TrainableAgent):
-    """Returns zeros after `base_ms` a batch, and has parameters that a learner may replace."""
+    """Returns zeros after `base_ms` per batch, and has parameters that a learner may replace."""
 
     Config: ClassVar[type[TrainedConfig]] = TrainedConfig
     trainable = "layers"
@@ -55,7 +57,7 @@ class Trained(TrainableAgent):
 
 
 def layers(parameters: int, dtype: str, value: float) -> dict[str, np.ndarray]:
-    """Return `parameters` numbers, all of one value, in layers of a million."""
+    """Return `parameters` equal numbers, in layers of a million."""
     sizes = [_LAYER] * (parameters // _LAYER) + [parameters % _LAYER]
     return {
         f"layer.{number}": np.full(size, value, dtype) for number, size in enumerate(sizes) if size
@@ -63,7 +65,7 @@ def layers(parameters: int, dtype: str, value: float) -> dict[str, np.ndarray]:
 
 
 class Sessions:
-    """Sessions in a process beside the learner's, each on its own thread."""
+    """Sessions in a process other than the learner's, each on a separate thread."""
 
     def __init__(self, url: str, number: int) -> None:
         """Begin the sessions, which follow the newest weights."""
@@ -73,8 +75,8 @@ class Sessions:
             agent.reset(self._obs, "act", weights="follow")
 
     def act(self, seconds: float) -> dict[str, Any]:
-        """Act for `seconds`; return the count of acts, the longest, ms, failures, and whether
-        versions only grew.
+        """Make calls for `seconds`; return the number of calls, the longest duration, ms, the
+        failures, and whether versions only increased.
         """
         ends = time.perf_counter() + seconds
         with ThreadPoolExecutor(len(self._agents)) as threads:
@@ -103,12 +105,12 @@ class Sessions:
 def measure_push(
     parameters: int, dtype: str, sessions: int, base_ms: float, rounds: int, seconds: float
 ) -> list[dict[str, Any]]:
-    """Return for each round the sessions' figures without and with a push, its seconds, and the
-    node's memory.
+    """Return for each round the sessions' figures without and with a push, the push's duration, s,
+    and the node's memory.
 
-    In a round the sessions act for `seconds` without a push, then for `seconds` with a push after
-    the first quarter. The memory is the largest decrease of available memory during the push, as a
-    multiple of the model's bytes, without the learner's own copy of the weights.
+    In a round the sessions make calls for `seconds` without a push, then for `seconds` with a push
+    after the first quarter. The memory is the largest decrease of available memory during the push,
+    as a multiple of the model's bytes, without the learner's own copy of the weights.
     """
     config = {"parameters": parameters, "dtype": dtype, "base_ms": base_ms}
     document = deployment("benchmarks.push:Trained", config=config, batch={"max_size": sessions})
@@ -170,19 +172,23 @@ def _available() -> int:
 
 
 def main(
-    parameters: Annotated[float, typer.Option(help="Parameters of the model.")] = 30e6,
+    parameters: Annotated[float, typer.Option(help="Number of parameters of the model.")] = 30e6,
     dtype: Annotated[
-        str, typer.Option(help="Of numpy; float16 has as many bytes as bfloat16.")
+        str, typer.Option(help="Type of numpy; float16 has as many bytes as bfloat16.")
     ] = "float32",
     sessions: Annotated[int, typer.Option(min=1)] = 16,
-    base_ms: Annotated[float, typer.Option(help="Time of a batch.")] = 20.0,
+    base_ms: Annotated[float, typer.Option(help="Duration of a batch, in ms.")] = 20.0,
     rounds: Annotated[int, typer.Option(min=1)] = 5,
     seconds: Annotated[
-        float, typer.Option(help="For which the sessions act, without a push and with one.")
+        float,
+        typer.Option(
+            help="Time for which the sessions make calls, without a push and with "
+            "a push, in seconds."
+        ),
     ] = 4.0,
     out_file: Out = None,
 ) -> None:
-    """Push weights under acting sessions."""
+    """Push weights while sessions make calls."""
     found = measure_push(int(parameters), dtype, sessions, base_ms, rounds, seconds)
     for row in found:
         alone, pushed = row["alone"], row["push"]

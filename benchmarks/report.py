@@ -38,12 +38,12 @@ benchmarks.report` writes this page.
 
 ## Round trips and throughput
 """
-# Beside the page.
+# File name of the picture, in the folder of the page.
 PICTURE = Path("pictures", "league.svg")
 THROUGHPUT_PICTURE = Path("pictures", "throughput.svg")
-Results = Mapping[str, Any]  # results of `collect`
+Results = Mapping[str, Any]  # the results of `collect`
 
-ON_NODE = ("plasma, Ray actor", "shm, Ray actor")  # the faster one first
+ON_NODE = ("plasma, Ray actor", "shm, Ray actor")  # two clients, the faster one first
 DEFAULT, JPEG = "websocket, default", "websocket, jpeg"
 THROUGHPUTS = ("throughput", "without_gain")
 # The parts of the figures that may lack systems, in words before the name of a system.
@@ -104,7 +104,9 @@ def collect(
 
 
 def write(results: Mapping[str, Any], page: Path, file: Path | None) -> None:
-    """Write the page, its picture beside it, and the figures into `file` for the next time."""
+    """Write the page, the pictures in the same folder, and the figures into `file` for the next
+    run.
+    """
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(results, indent=1) + "\n")
@@ -292,8 +294,8 @@ def _origin(results: Mapping[str, Any]) -> str:
 
 
 def _league(results: Results) -> str:
-    """Return the table of all systems: round trips, and the actions of the most clients by both
-    policies.
+    """Return the table of all systems: round trips, and the actions per second of the largest
+    number of clients with each policy.
     """
     rtt = results["rtt"]
     found = [{way["way"]: way for way in rows_of(results.get(name) or {})} for name in THROUGHPUTS]
@@ -327,7 +329,7 @@ def _league(results: Results) -> str:
 
 def rows_of(part: Results) -> list[Results]:
     """Return the rows of a measurement of throughput, ours and the peers', each with the name of
-    its way.
+    its client.
     """
     return [
         {"way": name, **row}
@@ -442,7 +444,8 @@ def main(
     ),
     calls: Calls = 1000,
     seconds: Annotated[
-        float, typer.Option(min=0.1, help="Of each measurement of the throughput.")
+        float,
+        typer.Option(min=0.1, help="Duration of each measurement of the throughput, in seconds."),
     ] = 2.0,
     peers_python: PeersPython = PYTHON,
     from_json: Annotated[

@@ -1,5 +1,5 @@
-"""Robots that act at their rate and do nothing else: `python -m benchmarks.robots URL [TRANSPORT
-ROBOTS]`.
+"""Runs robots that send requests at their rate and do nothing else: `python -m benchmarks.robots
+URL [TRANSPORT ROBOTS]`.
 
 Each line that the process reads is a burst, {"robots": 12, "hz": 10, "seconds": 20}. At its end it
 writes each robot's figures. With TRANSPORT and ROBOTS, the robots connect at once: the process
@@ -31,10 +31,11 @@ _CONNECT_S = 120.0
 class RobotBurst(NamedTuple):
     """One robot's figures of a burst."""
 
-    reset_s: float  # duration of the first reset, connection included
-    acts: list[tuple[float, float]]  # time of the answer, s of `time.time()`, and duration, ms
-    resumed: int  # acts before which the session had to begin again
-    failed: list[str]  # reasons of acts without an action, or of a failed reset
+    reset_s: float  # duration of the first reset, connection included, s
+    # Time of each answer, s of `time.time()`, and duration of the call, ms.
+    acts: list[tuple[float, float]]
+    resumed: int  # number of calls before which the session had to begin again
+    failed: list[str]  # reasons of calls without an action, or of a failed reset
 
 
 def burst(url: str, robots: int, hz: float, seconds: float) -> list[RobotBurst]:
@@ -44,7 +45,7 @@ def burst(url: str, robots: int, hz: float, seconds: float) -> list[RobotBurst]:
 
 
 def play(url: str, hz: float, seconds: float) -> RobotBurst:
-    """Run one robot. Ticks that pass during an act are skipped."""
+    """Run one robot. Ticks that pass during a call are skipped."""
     obs, acts, resumed, failed = observation(64, 1), [], 0, []
     with RemoteAgent(url, connect_timeout_s=_CONNECT_S, priority="robot") as agent:
         begun = time.time()
@@ -67,21 +68,22 @@ def play(url: str, hz: float, seconds: float) -> RobotBurst:
 
 
 class ConnectedRobots:
-    """Robots with a session each, which act at their rate."""
+    """Robots that send requests at their rate, each with a session."""
 
     def __init__(self, url: str, transport: str, robots: int) -> None:
         self._agents = [connect(url, transport, "jpeg", "robot") for _ in range(robots)]
-        # One after another, since a server accepts only so many handshakes at once.
+        # Robots connect one after another, since a server accepts only a limited number of
+        # handshakes at once.
         self.replicas: list[int] = [
             agent.reset(observation(), "measure")["pid"] for agent in self._agents
         ]
         self._threads = ThreadPoolExecutor(robots)
 
     def run(self, begin: float, end: float, hz: float) -> list[float]:
-        """Act at `hz` between two moments, s of `time.monotonic`; returns the time from tick to
-        action of each act, ms.
+        """Run the robots at `hz` between two times, s of `time.monotonic`, and return the time from
+        tick to action of each call, ms.
 
-        A tick that passes during an act is skipped.
+        A tick that passes during a call is skipped.
         """
 
         def play(agent: RemoteAgent, tick: float) -> list[float]:
@@ -93,7 +95,7 @@ class ConnectedRobots:
                 tick += max(1, math.ceil(taken[-1] * hz)) / hz
             return taken
 
-        phase = random.Random(os.getpid())  # other moments in each process
+        phase = random.Random(os.getpid())  # random times, which differ between processes
         ticks = [begin + phase.uniform(0, 1 / hz) for _ in self._agents]
         return [
             1e3 * taken

@@ -1,10 +1,11 @@
-"""Steps a second of `Rollouts` against a plain loop of the same environments and policy in one
-process, interleaved.
+"""Compares the steps per second of `Rollouts` with those of a plain loop over the same environments
+and policy in one process, interleaved.
 
-The loop is a learner's first program: it steps environments one after another, calls the policy
-once for all, and collects arrays. `Rollouts` steps as many environments in workers, with a server
-whose batches may hold all of them. One environment is also stepped without workers, in this
-process. With `--torchrl`, TorchRL's collector with its inference server also takes its turns.
+The loop is the simplest program of a learner: it steps environments one after another, calls the
+policy once for all environments, and collects arrays. `Rollouts` steps as many environments in
+workers, with a server whose batches may contain all of them. One environment is also stepped
+without workers, in this process. With `--torchrl`, TorchRL's collector with its inference server is
+also measured.
 """
 
 from __future__ import annotations
@@ -43,11 +44,12 @@ _POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
     "slow": ("noop", {"action_dim": 4, "base_ms": 20, "per_item_ms": 1}),
 }
 LOOP, OURS, LOCAL = "loop", "rollouts", "without Ray"
-_TARGETS = {("tiny", 1): 0.85, ("tiny", 16): 0.9, ("tiny", 64): 0.9}  # of the loop's rate; else 1
+# Minimum share of the loop's rate; 1 for all others.
+_TARGETS = {("tiny", 1): 0.85, ("tiny", 16): 0.9, ("tiny", 64): 0.9}
 
 
 class Tiny(Agent):
-    """Two layers of 64 on the state of the tabletop."""
+    """A policy with two layers of 64 units on the state of the tabletop."""
 
     shared: ClassVar[tuple[str, ...]] = ("layers",)
 
@@ -72,8 +74,8 @@ class Tiny(Agent):
 def loop(
     agent: Agent, num_envs: int, episodes: int, options: dict[str, Any], *, images: bool
 ) -> float:
-    """Return the steps a second of `episodes` episodes in this process, whose arrays are kept
-    until all are run.
+    """Return the steps per second of `episodes` episodes in this process; their arrays are kept
+    until all episodes have been run.
     """
     envs = [Tabletop(**options) for _ in range(num_envs)]
     seeds, steps, begun = itertools.count(), 0, time.perf_counter()
@@ -97,19 +99,21 @@ def loop(
 
 @dataclass(frozen=True, slots=True)
 class RolloutComparison:
-    """The ways that are measured in turns."""
+    """The settings of the comparison, whose programs are measured in turns."""
 
     policies: tuple[str, ...] = tuple(_POLICIES)
-    envs: tuple[int, ...] = (1, 16, 64)  # in all, of each way
-    workers: int = 2  # at most, for all environments
-    # Episodes of each mode in each round, rounded up to a multiple of the environments; a quarter
-    # of them if the mode is slow.
+    envs: tuple[int, ...] = (1, 16, 64)  # numbers of environments of each program
+    workers: int = 2  # maximum number of workers for all environments
+    # Number of episodes of each program in each round, rounded up to a multiple of the
+    # environments; a quarter of them if the program is slow.
     episodes: int = 64
     rounds: int = 3
     patience: float = 0.5  # `batch.patience` of the server
-    size: int = 224  # pixels a side
+    size: int = 224  # width and height of images, pixels
     images: bool = True  # whether images are kept
-    torchrl: str = ""  # "grouped" in as many workers, "processes", one for each env, or without it
+    # "grouped" environments in as many workers, "processes" with one environment each, or ""
+    # without TorchRL.
+    torchrl: str = ""
 
     def __post_init__(self) -> None:
         if unknown := set(self.policies) - set(_POLICIES):
@@ -127,7 +131,7 @@ class RolloutComparison:
         return {"width": self.size, "height": self.size}
 
     def turn(self, policy: str, envs: int) -> int:
-        """Return the episodes of a way in a round."""
+        """Return the number of episodes of a program in a round."""
         episodes = self.episodes if policy == "tiny" else self.episodes // 4
         return envs * math.ceil(episodes / envs)
 
@@ -135,7 +139,7 @@ class RolloutComparison:
 def compare_rollouts(
     plan: RolloutComparison, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Measure each policy with each number of environments; returns plain JSON values."""
+    """Measure each policy with each number of environments, and return plain JSON values."""
     rows = [_row(plan, policy, envs, progress) for policy in plan.policies for envs in plan.envs]
     return {"plan": asdict(plan), "cores": os.cpu_count(), "rows": rows}
 
@@ -203,13 +207,13 @@ def served(
 def collecting(
     policy: str | Callable[[], Agent], **settings: Any
 ) -> Iterator[Callable[[int], float]]:
-    """Yield a function that returns the steps a second of n episodes of `Rollouts` with these
+    """Yield a function that returns the steps per second of n episodes of `Rollouts` with these
     settings.
     """
     with Rollouts(RolloutPlan("tabletop", policy, **settings)) as rollouts:
         rollouts.collect(
             4 * max(1, settings["workers"]) * settings["num_envs"]
-        )  # workers start, and make their environments
+        )  # starts the workers, which make their environments
 
         def measure(episodes: int) -> float:
             begun = time.perf_counter()
@@ -220,8 +224,8 @@ def collecting(
 
 
 def torchrl_rate(layout: str, policy: str, episodes: int, **settings: Any) -> float:
-    """Return the steps a second of TorchRL's collector, measured in a new process by `rate`
-    there.
+    """Return the steps per second of TorchRL's collector, measured in a new process by its function
+    `rate`.
     """
     try:
         from benchmarks.torchrl_collector import rate
@@ -237,9 +241,10 @@ def torchrl_rate(layout: str, policy: str, episodes: int, **settings: Any) -> fl
 
 
 def rollout_outcomes(found: Mapping[str, Any]) -> list[Outcome]:
-    """Return the targets: of a tiny policy a share of the loop's rate, of a slow one all of it.
+    """Return the targets: for a tiny policy a share of the loop's rate, for a slow policy the whole
+    rate.
 
-    One environment is judged by its rate without Ray, which is how to play it.
+    A single environment is judged by its rate without Ray, which is the recommended way to run it.
     """
     outcomes = []
     for row in found["rows"]:
@@ -283,9 +288,16 @@ def main(
         _POLICIES
     ),
     envs: Annotated[str, typer.Option(help="Numbers of environments.")] = "1,16,64",
-    workers: Annotated[int, typer.Option(min=1, help="Workers of the rollouts, at most.")] = 2,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Maximum number of workers of the rollouts.")
+    ] = 2,
     episodes: Annotated[
-        int, typer.Option(min=4, help="Of each way in each round; a quarter if slow.")
+        int,
+        typer.Option(
+            min=4,
+            help="Number of episodes of each program in each round; a "
+            "quarter of it for slow programs.",
+        ),
     ] = 64,
     rounds: Annotated[int, typer.Option(min=1)] = 3,
     patience: Annotated[float, typer.Option(help="`batch.patience` of the server.")] = 0.5,
@@ -294,13 +306,13 @@ def main(
     torchrl: Annotated[
         str,
         typer.Option(
-            help="TorchRL's collector too: 'grouped' in as many workers, or 'processes', one for "
-            "each env."
+            help="Also measure TorchRL's collector: 'grouped' in as many workers, or 'processes', "
+            "one for each environment."
         ),
     ] = "",
     out_file: Out = None,
 ) -> None:
-    """Measure steps a second of each way, and their shares of the loop's."""
+    """Measure steps per second of each program, as shares of the loop's rate."""
     with errors():
         plan = RolloutComparison(
             tuple(parse_list(policies)),

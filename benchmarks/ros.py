@@ -1,5 +1,5 @@
-"""The time that topics of ROS 2 add: from an image on its topic to the action computed from it on
-another.
+"""Measures the time that topics of ROS 2 add: from an image on a topic to the action computed from
+it on another topic.
 
 A driver publishes images with a number in their first pixel, and times the actions, which repeat
 it. The policy is in this process and computes nothing, and no tick is awaited, so the time is that
@@ -35,7 +35,7 @@ Publish = Callable[[str, dict[str, Any]], object]
 
 
 class Repeating(Agent):
-    """Answers with the number in the first pixels of an image."""
+    """Returns the number in the first pixels of an image as the action."""
 
     contract = Contract(action=ActionSpec(dim=1, delta=False))
 
@@ -62,7 +62,7 @@ class Stopwatch:
 
 @contextlib.contextmanager
 def driver(link: str, kind: str, watch: Stopwatch) -> Iterator[tuple[str, Publish]]:
-    """Yield the robot's link, and its driver's function to publish."""
+    """Yield the robot's link, and the driver's function that publishes."""
     if link == "double":
         with import_module("rosbridge_double").rosbridge_double() as double:
             double.noticed = watch.arrived
@@ -117,7 +117,7 @@ def measure(link: str, *, compressed: bool, images: int) -> list[float]:
         player.initialize()
         player.reset(robot.observe())
         robot.apply(np.zeros(1, np.float32))
-        time.sleep(1.0)  # until the nodes have found each other
+        time.sleep(1.0)  # waits until the nodes have found each other
         over.set()
         begin.join()
         done = threading.Event()

@@ -1,11 +1,11 @@
-"""Round trips of one `act` by every transport, interleaved in one run.
+"""Measures round trips of one `act` with every transport, interleaved in one run.
 
-The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All
-clients take turns in short rounds, in a new random order each time, so that other load on the
+The observation is the same as in the paper's measurement: two 224x224 RGB cameras and seven joints.
+All clients take turns in short rounds, in a new random order each time, so that other load on the
 machine affects them alike. Every client is a process (those that need Ray, an actor); every server
-stays up, and idles between its turns. So each turn begins cold, which the 99th percentile shows; at
-the end the clients on the node also make calls without a break. CPU time and context switches of
-client and server are counted around each turn.
+keeps running, and idles between its turns. Each turn therefore begins cold, which affects the 99th
+percentile; at the end the clients on the node also make calls without a break. CPU time and context
+switches of client and server are counted around each turn.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from vlagents_ray.serve.launch.server import running_server
 
 POLICY = "benchmarks.round_trips:MeasuredNoop"
 LOOPBACK = "127.0.0.1"
-ROUND = 100  # calls of one client in its turn
-UNBROKEN = 200  # rounds' worth of calls without a break: a second or two
+ROUND = 100  # number of calls of one client in its turn
+UNBROKEN = 200  # calls without a break as a number of rounds; they take a second or two
 ON_NODE = ("shm", "plasma")
 
-# Given the file of the observation.
+# Is called with the file of the observation.
 StartClient = Callable[[Path], AbstractContextManager[ProcessDriver]]
 
 
 class MeasuredNoop(Noop):
     """The policy of the round trips: `reset` also returns the loss of the images' codec.
 
-    The loss is {"psnr_db"}: of the cameras, against the observation of the benchmark; None if they
-    are equal.
+    The loss is {"psnr_db"}, computed from the cameras and the observation of the benchmark; None if
+    they are equal.
     """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -55,15 +55,15 @@ class MeasuredNoop(Noop):
 
 @dataclass(frozen=True, slots=True)
 class RoundTripsOfAll:
-    """The round trips of all measured clients, and the reasons for skipped ones."""
+    """The round trips of all measured clients, and the reasons for skipped clients."""
 
     ours: tuple[RoundTrips, ...]
     theirs: tuple[RoundTrips, ...] = ()
     skipped: Mapping[str, str] = field(default_factory=dict)
-    steady: tuple[RoundTrips, ...] = ()  # of clients on the node, each without a break
-    # Quality of the images, by client; None: lossless.
+    steady: tuple[RoundTrips, ...] = ()  # round trips of clients on the node, each without a break
+    # Quality of the images by client; None if lossless.
     psnr_db: Mapping[str, float | None] = field(default_factory=dict)
-    # Use of resources per call, by client: `MeteredDriver.per_act`.
+    # Use of resources per call by client; see `MeteredDriver.per_act`.
     use: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -80,11 +80,11 @@ class RoundTripsOfAll:
 
 
 class MeteredDriver:
-    """A driver that also counts what an act uses of the machine: CPU time and context switches.
+    """A driver that also counts the resources of a call: CPU time and context switches.
 
     Args:
         driver: A driver that is ready.
-        server: The processes of its server.
+        server: The processes of the client's server.
     """
 
     def __init__(self, driver: ProcessDriver, server: Sequence[int]) -> None:
@@ -96,14 +96,14 @@ class MeteredDriver:
         return {}
 
     def measure(self, calls: int) -> list[float]:
-        """Make calls; returns their durations, ms."""
+        """Make calls, and return their durations, ms."""
         with self.server.counting(), self.client.counting():
             taken = self._driver.measure(calls)
         self._acts += calls
         return taken
 
     def per_act(self) -> dict[str, Any]:
-        """Return the use of client and server for each act so far, as `UsageMeter.per_act` does."""
+        """Return the use of client and server per call so far; see `UsageMeter.per_act`."""
         return {
             "client": self.client.per_act(self._acts),
             "server": self.server.per_act(self._acts),
@@ -111,8 +111,8 @@ class MeteredDriver:
 
 
 def metered(drivers: Mapping[str, ProcessDriver]) -> dict[str, MeteredDriver]:
-    """Count what the acts of ready drivers use beyond the use of the same processes while all
-    are idle.
+    """Count the resources of the calls of ready drivers, in excess of the use of the same processes
+    while they are idle.
     """
     others = [
         pid for one in drivers.values() for pid in (one.pid, one.server_pid) if pid is not None
@@ -138,15 +138,16 @@ def measure(
     host: str = LOOPBACK,
     prefix: Sequence[str] = (),
 ) -> RoundTripsOfAll:
-    """Measure our clients, and others by name with their own servers, interleaved."""
+    """Measure our clients, and the clients in `others` with their own servers, interleaved."""
     others = others or {}
     drivers: dict[str, ProcessDriver] = {}
     with contextlib.ExitStack() as stack:
         obs = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "observation.npz"
         save_observation(observation(), obs)
-        for name, start in others.items():  # before Ray, whose start takes longest
+        for name, start in others.items():  # started before Ray, whose start takes longest
             drivers[name] = stack.enter_context(start(obs))
-        # Without keys: a host other than loopback is one end of a link that only this run uses.
+        # No keys are needed: a host other than loopback is one end of a link that only this run
+        # uses.
         server = stack.enter_context(
             running_server(deployment(POLICY), host=host, insecure=host != LOOPBACK)
         )

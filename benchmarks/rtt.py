@@ -1,5 +1,5 @@
-"""Round trips and CPU time of one `act`: our transports, and other policy servers (`peers`), in
-turns in one run.
+"""Measures round trips and CPU time of one `act` for our transports and other policy servers
+(`peers`), in turns in one run.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ def measure_with_peers(
     """Measure round trips of our transports and of other policy servers.
 
     Args:
-        calls: Round trips of each client.
-        peers: Names of `peers.PEERS`, or "all"; one that is not installed is in "skipped", with the
-            cure.
+        calls: Number of round trips of each client.
+        peers: Names of `peers.PEERS`, or "all"; a peer that is not installed is in "skipped", with
+            the cure.
         peers_python: The Python in which they are installed.
-        transports: Of ours; by default all.
+        transports: Our transports; by default all.
         progress: Is called with lines of progress.
 
     Returns:
@@ -56,8 +56,8 @@ def main(
     peers_python: others.PeersPython = others.PYTHON,
     out_file: Out = None,
 ) -> None:
-    """Measure round trips and CPU time of acts on this machine: every transport, and other
-    policy servers, interleaved.
+    """Measure round trips and CPU time of calls on this machine: every transport, and other policy
+    servers, interleaved.
     """
     with errors():
         origin = measured_on("python -m benchmarks.rtt")

@@ -1,14 +1,14 @@
-"""A cluster of many workers on paper: which part saturates first, by the costs that
+"""Computes which part of a cluster with many workers saturates first, from the costs that
 `benchmarks.scaling` has measured.
 
     python -m benchmarks.scaling --out scaling.json
     python -m benchmarks.saturation scaling.json --workers 1000
 
-Each part has a load that grows with the workers, and a capacity. Loads of Ray's daemons on the head
-and of the driver are the measured ones, extended as a line, but the driver queries no more than
-`QUERIES_PER_S` workers a second. Those of replicas and of learners' images follow from sizes and
-times. Nothing is simulated: where a load does not grow as a line, as in a full network, it is
-higher than stated.
+Each part has a load that grows with the workers, and a capacity. The loads of the driver and of
+Ray's daemons on the head are extrapolated linearly from the measurements, but the driver queries at
+most `QUERIES_PER_S` workers per second. The loads of replicas and of learners' images follow from
+sizes and times. Nothing is simulated: where a load grows faster than linearly, as in a full
+network, it is higher than computed.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ ANSWERS = {
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What the workers do."""
+    """The work of the workers."""
 
     workers: int = 1000
-    steps: int = 250  # steps of an episode
+    steps: int = 250  # number of steps in an episode
     episode_s: float = 30.0
-    chunk: int = 8  # rows of an answer, all executed
-    act_ms: float = 60.0  # of a batch
+    chunk: int = 8  # number of rows in an answer, all executed
+    act_ms: float = 60.0  # duration of a batch, ms
     batch: int = 16
-    replicas: int = 16  # one a GPU
-    cameras: int = 2  # cameras of 224 x 224, in the transitions of a learner
-    mbit: float = 10_000.0  # Mbit/s of a node's link
+    replicas: int = 16  # number of replicas, one per GPU
+    cameras: int = 2  # number of cameras of 224 x 224 in the transitions of a learner
+    mbit: float = 10_000.0  # rate of a node's link, Mbit/s
 
     @property
     def acts_per_s(self) -> float:
-        """The requests of one worker."""
+        """The requests of one worker per second."""
         return self.steps / self.chunk / self.episode_s
 
 
@@ -74,8 +74,8 @@ class Part:
     each: float
 
     def row(self, workers: int) -> dict[str, Any]:
-        """Return the load with these workers, and the number that saturates the part; None: no
-        number does.
+        """Return the load with this number of workers, and the number that saturates the part; None
+        if no number does.
         """
         saturates = (1 - self.base) / self.each if self.each > 0 else None
         load = self.base + self.each * workers
@@ -83,14 +83,14 @@ class Part:
 
 
 def parts(scaling: Mapping[str, Any], load: Load) -> list[dict[str, Any]]:
-    """Return each part, the first to saturate first.
+    """Return the parts in the order in which they saturate.
 
     Args:
         scaling: The figures of `benchmarks.scaling`.
         load: The workers.
 
     Raises:
-        ConfigError: The figures have no two numbers of workers on one cluster.
+        ConfigError: The figures lack two numbers of workers on the same cluster.
     """
     cluster = scaling["clusters"][-1]
     rows = [row for row in cluster["rows"] if row["app"] == OWN]
@@ -99,7 +99,7 @@ def parts(scaling: Mapping[str, Any], load: Load) -> list[dict[str, Any]]:
             "scaling: expected two on the last cluster: --workers 1,16, got one number of workers"
         )
     costs, flooded = scaling["driver"]["costs_ms"], scaling["driver"]["flooded"]
-    watched = min(load.workers, QUERIES_PER_S * WATCH_S)  # a second
+    watched = min(load.workers, QUERIES_PER_S * WATCH_S)  # queried workers per second
     each_ms = (costs["episode"] + costs["step"] * load.steps) / load.episode_s
     base_ms = costs["second"] + costs["worker_second"] * watched
     batches = load.batch * load.replicas
@@ -163,13 +163,17 @@ def main(
         Path, typer.Argument(help="The figures of `python -m benchmarks.scaling --out`.")
     ],
     workers: Annotated[int, typer.Option(min=1)] = 1000,
-    steps: Annotated[int, typer.Option(min=1, help="Of an episode.")] = 250,
+    steps: Annotated[int, typer.Option(min=1, help="Number of steps of an episode.")] = 250,
     episode_s: Annotated[float, typer.Option(min=0.1, help="Its length.")] = 30.0,
-    chunk: Annotated[int, typer.Option(min=1, help="Rows of an answer, all executed.")] = 8,
-    act_ms: Annotated[float, typer.Option(min=0, help="Of a batch.")] = 60.0,
-    batch: Annotated[int, typer.Option(min=1, help="Rows of a batch.")] = 16,
+    chunk: Annotated[
+        int, typer.Option(min=1, help="Number of rows in an answer, all of which are executed.")
+    ] = 8,
+    act_ms: Annotated[float, typer.Option(min=0, help="Duration of a batch, in ms.")] = 60.0,
+    batch: Annotated[int, typer.Option(min=1, help="Number of rows in a batch.")] = 16,
     replicas: Annotated[int, typer.Option(min=1)] = 16,
-    mbit: Annotated[float, typer.Option(min=1, help="Mbit/s of a node's link.")] = 10_000.0,
+    mbit: Annotated[
+        float, typer.Option(min=1, help="Rate of a node's link, in Mbit/s.")
+    ] = 10_000.0,
     out_file: Out = None,
 ) -> None:
     """Compute the load of each part of a cluster, and the number of workers that saturates it."""

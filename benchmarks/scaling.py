@@ -1,15 +1,17 @@
-"""Scaling of episodes a minute with the number of workers, and the capacity of one driver.
+"""Measures the scaling of episodes per minute with the number of workers, and the capacity of one
+driver.
 
 Environment and policy sleep, so that many workers run on few cores and only the overhead is
-measured. On clusters of one to three hosts (`benchmarks.hosts`), or on a running one, evaluations
-with increasing numbers of workers take turns with one of a single worker; the rate is that while
-all were running, so that their start does not count. Every node has a replica for each of its
-workers, so that none waits for another's batch. Links between the hosts have the given rate and
-delay, and the bytes that hosts send are counted, from the begin of an evaluation to its end. On the
-first cluster, all workers also share one replica a node, with single actions and with chunks.
+measured. On clusters of one to three hosts (`benchmarks.hosts`), or on a running cluster,
+evaluations with increasing numbers of workers alternate with an evaluation with a single worker.
+The rate counts only while all workers are running, so that their start does not count. Every node
+has a replica for each of its workers, so that no worker waits for another worker's batch. Links
+between the hosts have the given rate and delay, and the bytes that hosts send are counted from the
+beginning of an evaluation to its end. On the first cluster, all workers also share one replica per
+node, with single actions and with chunks.
 
 The driver is measured by short evaluations with steps, episodes and workers in different
-proportions. Its CPU time is fitted by the costs of an episode, a step, and a second of a busy
+proportions. Its CPU time is fitted with the costs of an episode, a step, and a second of a busy
 worker.
 """
 
@@ -38,14 +40,15 @@ from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
-# applications: a replica a worker; one a node, acts and chunks.
+# Applications: one replica per worker; one replica per node, with single actions and with chunks.
 OWN, SHARED, CHUNKS = "own", "shared", "chunks"
-CHUNK = 8  # rows
-IMAGE_BYTES = 224 * 224 * 3  # image bytes of each act's observation
+CHUNK = 8  # number of rows of a chunk
+IMAGE_BYTES = 224 * 224 * 3  # image bytes of each call's observation
 _START_S = 300.0
 _PLAY_S = 600.0
-_LATE_S = 1.0  # longest delay between the starts of two workers
-# Steps, ms a step, and share of the workers, in different proportions, so that costs can be fitted.
+_LATE_S = 1.0  # maximum delay between the starts of two workers, s
+# Number of steps, duration of a step in ms, and share of the workers, in different proportions, so
+# that costs can be fitted.
 _COSTS = ((10, 10.0, 0.25), (100, 1.0, 0.25), (10, 200.0, 0.25), (10, 50.0, 1.0), (10, 400.0, 1.0))
 _COST_S = 5.0
 
@@ -57,14 +60,14 @@ class ScalingPlan:
     """
 
     workers: tuple[int, ...] = (1, 2, 4, 8, 16)
-    nodes: tuple[int, ...] = (1, 2, 3)  # sizes of clusters; ignored on a running one
+    nodes: tuple[int, ...] = (1, 2, 3)  # numbers of hosts; ignored on a running cluster
     rounds: int = 3
     step_ms: float = 20.0
     policy_ms: float = 50.0
-    steps: int = 50  # steps of an episode
-    seconds: float = 8.0  # in which all workers play together, about
-    mbit: float = 1000.0  # Mbit/s of a link between two hosts, each way
-    delay_ms: float = 5.0  # delay of such a link, each way
+    steps: int = 50  # number of steps in an episode
+    seconds: float = 8.0  # approximate time in which all workers run at the same time, s
+    mbit: float = 1000.0  # rate of a link between two hosts in each direction, Mbit/s
+    delay_ms: float = 5.0  # delay of such a link in each direction, ms
 
     def __post_init__(self) -> None:
         if self.workers[0] != 1 or list(self.workers) != sorted(set(self.workers)):
@@ -78,14 +81,14 @@ class ScalingPlan:
         return self.workers[-1]
 
     def round(self, workers: int, app: str) -> ScalingRound:
-        """Plan an evaluation in which all workers play together for `seconds`."""
+        """Plan an evaluation in which all workers run at the same time for `seconds`."""
         acts = self.steps / (CHUNK if app == CHUNKS else 1)
         episode_s = (self.steps * self.step_ms + acts * self.policy_ms) / 1e3
         episodes = math.ceil((self.seconds + workers * _LATE_S) / episode_s) + 1
         return ScalingRound(workers, episodes, self.steps, self.step_ms, app)
 
     def ideal(self, workers: int, app: str) -> float:
-        """Return the episodes a minute of workers that only sleep and never wait."""
+        """Return the episodes per minute of workers that only sleep and never wait."""
         acts = math.ceil(self.steps / (CHUNK if app == CHUNKS else 1))
         return 60e3 * workers / (self.steps * self.step_ms + acts * self.policy_ms)
 
@@ -93,9 +96,9 @@ class ScalingPlan:
 def measure_scaling(
     plan: ScalingPlan, address: str | None = None, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Measure all clusters, or the running one at `address`; returns plain JSON values."""
+    """Measure all clusters, or the running cluster at `address`, and return plain JSON values."""
     found: dict[str, Any] = {"plan": asdict(plan), "cores": os.cpu_count(), "clusters": []}
-    clusters = (0,) if address else plan.nodes  # 0: all nodes
+    clusters = (0,) if address else plan.nodes  # 0 stands for all nodes
     for nodes in clusters:
         shared = nodes == clusters[0]
         with driving(plan, nodes, address, shared=shared) as (driver, size, made):
@@ -112,8 +115,8 @@ def measure_scaling(
 def driving(
     plan: ScalingPlan, nodes: int, address: str | None = None, *, shared: bool = False
 ) -> Iterator[tuple[LineProcess, int, Sequence[Host]]]:
-    """Start a driver and its policies on `nodes` hosts or at `address`; yields it, the nodes'
-    number, and the hosts.
+    """Start a driver and its policies on `nodes` hosts or at `address`; yield the driver, the
+    number of nodes, and the hosts.
 
     `shared` adds the policies of workers that share a replica.
     """
@@ -127,13 +130,15 @@ def driving(
         start: Callable[[list[str]], list[str]] = list
         made: Sequence[Host] = ()
         if address is None:
-            resources = json.dumps({OWN: slots, SHARED: 1, CHUNKS: 1})  # for replicas, on each node
+            # Resources for replicas on each node.
+            resources = json.dumps({OWN: slots, SHARED: 1, CHUNKS: 1})
             made = stack.enter_context(hosts(nodes))
             for one, other in itertools.combinations(made, 2):
                 device = f"far{one.number}{other.number}"
                 link = stack.enter_context(FarLink(one, other, device=device, own=True))
                 link.set(Conditions(plan.delay_ms, mbit=plan.mbit))
-            # Ray's workers would wait for other processes here; our own server sets the same.
+            # Without this, Ray's workers would wait for other processes here; our own server sets
+            # the same value.
             environment = our_environment() | {"RAY_worker_niceness": "0"}
             cluster = stack.enter_context(
                 ray_cluster(made, slots, environment, resources=resources)
@@ -158,10 +163,10 @@ def measure_cluster(
     *,
     shared: bool = False,
 ) -> dict[str, Any]:
-    """Measure rates by number of workers, in rounds that play each once; `shared` adds workers that
-    share a replica.
+    """Measure rates by number of workers, in rounds that run each number once; `shared` adds
+    workers that share a replica.
 
-    `made` are the hosts whose traffic is counted.
+    `made` contains the hosts whose traffic is counted.
     """
     counts = [workers for workers in plan.workers if workers == 1 or workers >= nodes]
     kinds = [(OWN, workers) for workers in counts]
@@ -195,8 +200,8 @@ def row(
 ) -> dict[str, Any]:
     """Compute medians over rounds; `single` has the episodes of one worker in the same rounds.
 
-    Linear is that many times the single worker of the round; with chunks, which no single worker
-    run, the rate that the sleeps alone allow.
+    Linear scaling is the rate of the round's single worker times the number of workers. For chunks,
+    which no single worker runs, it is the rate that the sleeps alone allow.
     """
     rates = [one.rate for one in played]
     sent = [one.sent_bytes / one.acts for one in played if one.sent_bytes is not None]
@@ -260,8 +265,8 @@ def fit(rounds: Sequence[ScalingRound], played: Sequence[PlayedEpisodes]) -> dic
     """Fit the CPU time of a driver, ms, for an episode, a step, a second of each worker, and a
     second.
 
-    By least squares of relative errors, so that short rounds count as much as long ones. A cost
-    below 0 is left out, and the others are fitted without it.
+    The fit minimises the squares of relative errors, so that short rounds count as much as long
+    rounds. A cost below 0 is set to 0, and the other costs are fitted without it.
     """
     names = ["episode", "step", "worker_second", "second"]
     causes = np.array(
@@ -343,27 +348,37 @@ def main(
         str, typer.Option(help="Numbers of workers, ascending from 1.")
     ] = "1,2,4,8,16",
     nodes: Annotated[
-        str, typer.Option(help="Sizes of the clusters, of hosts that are made on this machine.")
+        str, typer.Option(help="Numbers of hosts of the clusters that are made on this machine.")
     ] = ("1,2,3"),
     rounds: Annotated[int, typer.Option(min=1)] = 3,
     step_ms: Annotated[
-        float, typer.Option(min=0, help="Each step of the environment sleeps so long.")
+        float, typer.Option(min=0, help="Duration of a step of the environment, in ms.")
     ] = 20.0,
-    policy_ms: Annotated[float, typer.Option(min=0, help="And each batch of the policy.")] = 50.0,
+    policy_ms: Annotated[
+        float, typer.Option(min=0, help="Duration of a batch of the policy, in ms.")
+    ] = 50.0,
     seconds: Annotated[
-        float, typer.Option(min=0.1, help="That all workers play together, about.")
+        float,
+        typer.Option(
+            min=0.1, help="Approximate time in which all workers run at the same time, in seconds."
+        ),
     ] = 8.0,
     mbit: Annotated[
-        float, typer.Option(min=1, help="Mbit/s of a link between two hosts that are made.")
+        float, typer.Option(min=1, help="Rate of a link between two of these hosts, in Mbit/s.")
     ] = 1000.0,
-    delay_ms: Annotated[float, typer.Option(min=0, help="Of such a link, each way.")] = 5.0,
+    delay_ms: Annotated[
+        float, typer.Option(min=0, help="Delay of such a link in each direction, in ms.")
+    ] = 5.0,
     address: Annotated[
         str | None,
-        typer.Option(help="A running Ray cluster in place of those hosts; they want root."),
+        typer.Option(
+            help="Address of a running Ray cluster, which replaces these hosts; making "
+            "hosts needs root."
+        ),
     ] = None,
     out_file: Out = None,
 ) -> None:
-    """Measure episodes a minute by the number of workers and nodes, and the cost of the
+    """Measure episodes per minute by the number of workers and nodes, and the cost of the
     evaluation's driver.
     """
     with errors():

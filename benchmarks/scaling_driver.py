@@ -2,9 +2,9 @@
 benchmarks.scaling_driver JSON`.
 
 It serves policies that sleep, writes a line of JSON when they are ready, and answers each
-`ScalingRound`, a line of JSON, with a `PlayedEpisodes`. Like `vlagents-ray eval`, it is Serve's
-client and the evaluation's driver in one process, so that its CPU time, over all threads, is a
-driver's.
+`ScalingRound`, a line of JSON, with a `PlayedEpisodes`. Like `vlagents-ray eval`, it is both
+Serve's client and the evaluation's driver, so that its CPU time over all threads is that of a
+driver.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
 NEAR = ("shm", "plasma", "local")  # transports within a node
-DAEMONS = ("gcs_server", "raylet", "ServeController")  # daemons of this node
+DAEMONS = ("gcs_server", "raylet", "ServeController")  # names of Ray's daemons on this node
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +49,11 @@ class Fleet:
 
     replicas: int
     chunk: int = 1
-    pinned: bool = False  # each reserves one unit of a resource with the application's name
+    # Number of replicas; each reserves one unit of a resource with the application's name.
+    pinned: bool = False
 
     def args(self, app: str, policy_ms: float) -> dict[str, Any]:
-        """Return the arguments of its deployment."""
+        """Return the arguments of the application's deployment."""
         return {
             "config": {"action_dim": ACTION_DIM, "chunk": self.chunk, "base_ms": policy_ms},
             "replicas": self.replicas,
@@ -62,44 +63,47 @@ class Fleet:
 
 @dataclass(frozen=True, slots=True)
 class ScalingRound:
-    """An evaluation to play."""
+    """An evaluation to run."""
 
     workers: int
-    episodes: int  # episodes of each worker
+    episodes: int  # number of episodes of each worker
     steps: int
     step_ms: float
-    app: str | None = None  # None: a policy in each worker's own process, which takes no time
+    # Name of the application; None for a policy in each worker's own process, which takes no time.
+    app: str | None = None
     size: int = 224
 
 
 class PlayedEpisodes(NamedTuple):
     """The figures of a `ScalingRound`."""
 
-    # While all workers were running; None with a policy in their own processes.
+    # Rate while all workers were running; None with a policy in the workers' own processes.
     episodes_per_minute: float | None
-    wall_s: float  # wall time of the whole evaluation, start of the workers included
+    wall_s: float  # wall time of the whole evaluation, including the start of the workers, s
     transports: list[str]
-    failures: int  # attempts
+    failures: int  # number of failed attempts
     # From the first recorded episode to the last:
     episodes: int
     span_s: float
-    busy_s: float  # that workers were running, added up
-    driver_s: float  # CPU time of this process
-    daemons_s: dict[str, float]  # and of Ray's on this node
+    busy_s: float  # running time of all workers together, s
+    driver_s: float  # CPU time of this process, s
+    daemons_s: dict[str, float]  # CPU time of Ray's daemons on this node, s
     near: float = 1.0  # share of the workers whose observations do not leave their node
-    acts: int = 1  # acts of all recorded episodes
-    # By all hosts to others, start of the workers included; None: not counted.
+    acts: int = 1  # number of calls in all recorded episodes
+    # Bytes that all hosts sent to others, including the start of the workers; None if not counted.
     sent_bytes: int | None = None
 
     @property
     def rate(self) -> float:
-        """The episodes a minute of a round with an application."""
+        """The episodes per minute of a round with an application."""
         assert self.episodes_per_minute is not None, "a round without one has no rate"  # noqa: S101
         return self.episodes_per_minute
 
 
 class ScalingLedger(Progress):
-    """The time of each recorded episode, and the CPU time of the driver and the daemons by then."""
+    """Records the time of each recorded episode, and the CPU time of the driver and the daemons
+    until then.
+    """
 
     def __init__(self) -> None:
         self.at_s, self.cpu_s = array("d"), array("d")
@@ -118,8 +122,8 @@ class ScalingLedger(Progress):
 
 
 def play(one: ScalingRound, out: Path) -> PlayedEpisodes:
-    """Play a round; `out` is a new folder. Raises `EnvFailed` if its workers were never all
-    running.
+    """Run a round; `out` is a new folder. Raises `EnvFailed` if the workers were never
+    all running.
     """
     policy = PolicyConfig(name="noop", url=None if one.app is None else f"serve://{one.app}")
     options: dict[str, Any] = {"step_ms": one.step_ms, "max_steps": one.steps, "size": one.size}
@@ -163,7 +167,7 @@ def daemons_s() -> dict[str, float]:
     """Return the CPU time that Ray's own processes of this node have used so far, s."""
     found = dict.fromkeys(DAEMONS, 0.0)
     for entry in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it has ended
+        with contextlib.suppress(OSError):  # the process has ended
             if (name := program(pid := int(entry.name))) in found:
                 found[name] += cpu_seconds(pid)
     return found

@@ -1,8 +1,8 @@
-"""Autoscaling by the objective on a real server: a burst of robots comes, and goes again.
+"""Traces autoscaling by the objective on a real server while a burst of robots comes and leaves.
 
-One robot executes chunks all the time. After a while the others come at once, and later they leave.
-The policy takes the time of a real one without computing, so that several replicas run on few
-cores. The replicas are sampled throughout, and each robot counts its ticks without an action.
+One robot executes chunks all the time. After a while the other robots come at once, and later they
+leave. The policy takes the time of a real one without computing, so that several replicas run on
+few cores. The replicas are sampled throughout, and each robot counts its ticks without an action.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 _AHEAD_S = 0.5
 _LATE_S = 60.0
 _ROBOTS_A_PROCESS = 8
-_SETTLED_S = 5.0  # time in which a burst that is in time again misses no tick
+_SETTLED_S = 5.0  # time without a missed tick after which a burst counts as in time again, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +39,13 @@ class TracePlan:
 
     robots: int = 16
     hz: float = 5.0
-    chunk: int = 8  # rows of an answer
-    base_ms: float = 100.0  # of a batch; a replica serves ten such robots
+    chunk: int = 8  # number of rows in an answer
+    base_ms: float = 100.0  # duration of a batch, ms; a replica serves ten such robots
     row_ms: float = 60.0
     batch: int = 8
-    alone_s: float = 20.0  # of the first robot
+    alone_s: float = 20.0  # time of the first robot alone before the burst, s
     burst_s: float = 60.0
-    after_s: float = 40.0  # of the first robot
+    after_s: float = 40.0  # time of the first robot alone after the burst, s
     transport: str = "websocket"
     autoscaling: Mapping[str, float] = field(
         default_factory=lambda: {"max_replicas": 2, "downscale_delay_s": 10}
@@ -95,7 +95,7 @@ def trace(url: str, plan: TracePlan, progress: Callable[[str], None] = lambda _:
         burst_figures = []
         for process in others:
             burst_figures += process.read(plan.alone_s + plan.burst_s + _LATE_S)
-        come.close()  # their sessions end
+        come.close()  # ends the sessions of these robots
         progress("one robot is left …")
         first_figures = first.read(plan.burst_s + plan.after_s + _LATE_S)
         zero = time.time() - (time.monotonic() - burst)
@@ -125,8 +125,8 @@ def report(
     Args:
         plan: The plan of the trace.
         samples: The replicas, with times in s since the burst.
-        first: The figures of the robot that was there all the time, see `fleet_robots`.
-        burst: Those of the others.
+        first: The figures of the robot that was connected all the time, see `fleet_robots`.
+        burst: The figures of the other robots.
     """
     robots = [*first, *burst]
     late: list[float] = []
@@ -145,7 +145,7 @@ def report(
         "late": late,
         "ticks": ticks,
         "starved": sum(robot["starved"] for robot in robots) - _missed(robots),
-        "missed": _missed(robots),  # since the robots' own process was late
+        "missed": _missed(robots),  # ticks that were late because the robots' own process was late
         "starved_by_first": first[0]["starved"] - first[0]["missed"],
         "resumed": sum(robot["resumed"] for robot in robots),
         "failed": sorted({robot["failed"] for robot in robots if robot["failed"]}),
@@ -196,9 +196,13 @@ def show_trace(traced: Mapping[str, Any]) -> None:
 
 
 def main(
-    robots: Annotated[int, typer.Option(min=2, help="With the one that comes first.")] = 16,
-    replicas: Annotated[int, typer.Option(min=1, help="At most.")] = 2,
-    seconds: Annotated[float, typer.Option(min=10, help="Of the burst.")] = 60.0,
+    robots: Annotated[
+        int, typer.Option(min=2, help="Number of robots, including the first one.")
+    ] = 16,
+    replicas: Annotated[int, typer.Option(min=1, help="Maximum number of replicas.")] = 2,
+    seconds: Annotated[
+        float, typer.Option(min=10, help="Duration of the burst, in seconds.")
+    ] = 60.0,
     transport: Annotated[str, typer.Option(help="websocket, http or shm.")] = "websocket",
     out_file: Out = None,
 ) -> None:

@@ -1,9 +1,10 @@
-"""Autoscaling by the objective, in virtual time: traces of a burst, a square wave and a slow rise.
+"""Simulates autoscaling by the objective in virtual time: traces of a burst, a square wave and a
+slow rise.
 
 The real policy of autoscaling is called as Serve's controller calls it, with the reports of
-simulated replicas: each takes a while to start, holds its share of the robots once they have moved,
-and misses ticks where they need more of it than it has. The delays before a change are those of the
-deployment's settings: a change must be requested without a break for that long.
+simulated replicas. Each replica takes a while to start, serves its share of the robots once they
+have moved, and misses ticks when the robots need more than its capacity. The delays before a change
+are those of the deployment's settings: a change must be requested without a break for that long.
 """
 
 from __future__ import annotations
@@ -33,10 +34,11 @@ from vlagents_ray.serve.scaling.autoscaling import (
 from vlagents_ray.serve.scaling.slo_load import most_on_replica, slo_load
 from vlagents_ray.slo import SHARE
 
-PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled: s
-FRESH = RobotNeed(hz=10.0, rows=8, age_s=0.2)  # a replica of pi0 serves seven such robots
-_STEP_S = 1.0  # step of virtual time
-_WINDOW_S = 10  # over which a robot's share is computed
+PI0 = CostCurve(0.0293, 0.00806)  # costs of pi0 on an H200, compiled, s
+# Needs of a robot; a replica of pi0 serves seven such robots.
+FRESH = RobotNeed(hz=10.0, rows=8, age_s=0.2)
+_STEP_S = 1.0  # step of virtual time, s
+_WINDOW_S = 10  # time over which a robot's share is computed, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,31 +48,33 @@ class SimulatedFleet:
     need: RobotNeed = FRESH
     costs: CostCurve = PI0
     max_batch_size: int = 16
-    start_s: float = 30.0  # start of a replica
-    # From the start of a replica until its share of the sessions has moved to it: it tells the
-    # others that it has started, and their clients reconnect after their next answers.
+    start_s: float = 30.0  # duration of the start of a replica, s
+    # Time from the start of a replica until its share of the sessions has moved to it, s: the
+    # replica tells the others that it has started, and their clients reconnect after their next
+    # answers.
     move_s: float = 2.0
     autoscaling: AutoscalingArgs = field(default_factory=partial(AutoscalingArgs, max_replicas=16))
     hidden_late: Callable[[int, int], int] | None = None
-    """Returns the robots that are late for a reason that their needs do not show, for a number of
-    replicas and of robots."""
+    """Returns, for a number of replicas and of robots, the number of robots that are late for a
+    reason that their needs do not show.
+    """
 
 
 class ScalingStep(NamedTuple):
     """One second of a trace."""
 
-    at: float  # s
+    at: float  # time, s
     robots: int
-    replicas: int  # that hold robots
-    requested: int  # replicas
-    missed: float  # share of the robots' ticks in this second
+    replicas: int  # number of replicas that serve robots
+    requested: int  # number of requested replicas
+    missed: float  # share of the robots' ticks that were missed in this second
 
 
 class _Report(NamedTuple):
-    """The sums of what all replicas report at one moment."""
+    """The sums of the reports of all replicas at one time."""
 
-    at: float  # s
-    values: dict[str, float]  # by name
+    at: float  # time, s
+    values: dict[str, float]  # reported values by name
 
 
 @dataclass(slots=True)
@@ -78,7 +82,7 @@ class _Controller:
     """Serve's controller, with the delays before a change."""
 
     policy: MeasuredLoad
-    options: Mapping[str, Any]  # those of Serve
+    options: Mapping[str, Any]  # autoscaling options of Serve
     target: int = 1
     state: dict[str, Any] = field(default_factory=dict)
     requested_since: float | None = None
@@ -134,10 +138,10 @@ def simulate(
     """
     options = fleet.autoscaling.options()
     controller = _Controller(MeasuredLoad(**options["policy"]["policy_kwargs"]), options)
-    ready_at = [0.0]  # when each replica holds its share of the robots
+    ready_at = [0.0]  # the times at which each replica serves its share of the robots, s
     reports: list[_Report] = []
     reported_robots = 0
-    shares: list[float] = []  # shares of ticks missed, in the last seconds
+    shares: list[float] = []  # shares of missed ticks in the last seconds
     trace = []
     now = 0.0
     while now < seconds:
@@ -189,17 +193,17 @@ def seconds_late(trace: list[ScalingStep]) -> float:
 
 
 def burst(now: float) -> int:
-    """Return one robot, and 16 after a minute."""
+    """Return 1 robot, and 16 robots after a minute."""
     return 1 if now < 60 else 16
 
 
 def square_wave(now: float) -> int:
-    """Return 4 and 12 robots in turns of two minutes."""
+    """Return 4 and 12 robots, alternating every two minutes."""
     return 4 if now % 240 < 120 else 12
 
 
 def slow_rise(now: float) -> int:
-    """Return one more robot each minute, up to 24."""
+    """Return a number of robots that grows by one each minute, up to 24."""
     return min(24, 1 + int(now // 60))
 
 

@@ -1,10 +1,11 @@
-"""Endurance of one evaluation with many episodes and killed workers: memory, speed, and lost
-episodes.
+"""Tests the endurance of one evaluation with many episodes and killed workers: memory, speed, and
+lost episodes.
 
 Images are small and steps few, so that the work around an episode is measured. The gap is the time
-between an episode's last step and the next one's reset in the same worker: the result, its way to
-the driver, the database, and the next job. The youngest worker is killed at intervals; the eldest
-runs from the first episode to the last, and its memory and the driver's are sampled.
+between an episode's last step and the next episode's reset in the same worker; it contains the
+result, its transport to the driver, the database, and the next job. The youngest worker is killed
+at intervals. The oldest worker runs from the first episode to the last; its memory and the driver's
+memory are sampled.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
 LIMIT_GAP_MS = 5.0
-LIMIT_SLOWDOWN = 1.25  # of the last thousand episodes against the first, noise included
-LIMIT_GROWTH_MIB = 0.5  # of a process in a thousand episodes
-_EVERY_S = 0.5  # between two samples of the memory
+LIMIT_SLOWDOWN = 1.25  # maximum ratio of the last thousand episodes to the first, including noise
+LIMIT_GROWTH_MIB = 0.5  # maximum growth of a process in a thousand episodes
+_EVERY_S = 0.5  # time between two samples of the memory, s
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _MIB = 2**20
-_SETTLING = 0.2  # of the episodes, in which pools and caches fill
+_SETTLING = 0.2  # share of the episodes in which pools and caches fill
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +52,14 @@ class SoakPlan:
 
     episodes: int = 10_000
     workers: int = 2
-    kill_every_s: float = 30.0  # 0: never
+    kill_every_s: float = 30.0  # time between two kills, s; 0 for no kills
     max_steps: int = 20
-    size: int = 32  # pixels a side
+    size: int = 32  # width and height of images, pixels
 
     @property
     def window(self) -> int:
-        """The number of first, and of last, episodes that are compared: at most a quarter of
-        all.
+        """The number of first episodes, and of last episodes, that are compared: at most a quarter
+        of all.
         """
         return min(1000, self.episodes // 4)
 
@@ -66,15 +67,15 @@ class SoakPlan:
 class ResourceSample(NamedTuple):
     """Memory at one moment."""
 
-    episodes: int  # recorded so far
-    driver: int  # resident bytes
-    eldest: int | None  # of the first worker; None once it has ended
+    episodes: int  # number of episodes recorded so far
+    driver: int  # resident memory of the driver, bytes
+    eldest: int | None  # resident memory of the first worker, bytes; None once the worker has ended
 
 
 def measure_soak(
     soak: SoakPlan, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Play the evaluation and watch it; returns plain JSON values."""
+    """Run the evaluation, monitor it, and return plain JSON values."""
     ledger = SoakLedger(progress)
     cpus = max(os.cpu_count() or 1, soak.workers)
     with (
@@ -108,10 +109,10 @@ def measure_soak(
 
 
 class SoakLedger(Progress):
-    """The time of each recorded episode, and the driver's CPU time by then."""
+    """Records the time of each recorded episode, and the driver's CPU time until then."""
 
     def __init__(self, progress: Callable[[str], None]) -> None:
-        # Arrays of s of `time.time()`, which are small compared with the growth to detect.
+        # Arrays of times, s of `time.time()`, which are small compared with the growth to detect.
         self.at_s, self.cpu_s = array("d"), array("d")
         self._progress = progress
 
@@ -132,7 +133,7 @@ class SoakWatcher:
         self._notes = notes
         self._ledger = ledger
         self._soak = soak
-        self._seen: list[int] = []  # workers that have finished an episode, the eldest first
+        self._seen: list[int] = []  # workers that have finished an episode, the oldest first
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="soak", daemon=True)
 
@@ -145,7 +146,7 @@ class SoakWatcher:
         self._thread.join()
 
     def _watch(self) -> None:
-        since: float | None = None  # the first episode, or the last kill
+        since: float | None = None  # time of the first episode, or of the last kill
         while not self._stop.wait(_EVERY_S):
             self._seen += [
                 pid
@@ -168,7 +169,7 @@ class SoakWatcher:
                 since = time.monotonic()
 
     def _kill(self) -> bool:
-        """Kill the youngest worker, once all are running."""
+        """Kill the youngest worker, if all workers are running."""
         playing = [pid for pid in self._seen if is_worker(pid)]
         if len(playing) < self._soak.workers:
             return False
@@ -179,7 +180,7 @@ class SoakWatcher:
 
 
 def is_worker(pid: int) -> bool:
-    """Return whether that process is one of Ray's, and not a later one with the same number."""
+    """Return whether the process is one of Ray's, and not a later process with the same id."""
     try:
         return b"ray::" in Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
@@ -233,8 +234,8 @@ def report(
 
 
 def gaps(workers: Iterable[Sequence[EpisodeTimes]]) -> list[float]:
-    """Return the times between two episodes of a worker, s, in the order in which the later ones
-    began.
+    """Return the times between two episodes of a worker, s, in the order in which the later
+    episodes began.
     """
     pairs = [pair for notes in workers for pair in itertools.pairwise(notes)]
     return [
@@ -330,12 +331,12 @@ def main(
     episodes: Annotated[int, typer.Option(min=100)] = 10_000,
     workers: Annotated[int, typer.Option(min=1)] = 2,
     kill_every: Annotated[
-        float, typer.Option(min=0, help="Seconds between two kills of a worker; 0: none.")
+        float, typer.Option(min=0, help="Seconds between two kills of a worker; 0: no kills.")
     ] = 30.0,
     out_file: Out = None,
 ) -> None:
-    """Play many short episodes while workers are killed: check memory, overhead, and that each
-    is run once.
+    """Run many short episodes while workers are killed; check memory, overhead, and that each
+    episode is run once.
     """
     with errors():
         found = measure_soak(SoakPlan(episodes, workers, kill_every), progress)

@@ -1,5 +1,5 @@
-"""Seconds from a command to its first episode or action, and to its end, from cold; ours and
-vla-eval's in turns.
+"""Measures the time from a command to its first episode or action, and to its end, with a cold
+start; our commands and vla-eval's alternate.
 
 - `eval --workers 0` and `eval --workers 1`: `vlagents-ray eval` of a policy that does nothing, in
   one process and with Ray and Serve;
@@ -36,17 +36,17 @@ from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.serve.ports import LOOPBACK, free_port
 
 PEER, SERVE = "vla-eval", "serve noop"
-_LONGEST_S = 120.0  # for a server to start or end
+_LONGEST_S = 120.0  # time limit for a server to start or end, s
 _COMMAND = [sys.executable, "-c", "from vlagents_ray.cli import main; main()"]
 
-Seconds = tuple[float, float]  # to the first episode or action, and to the end
+Seconds = tuple[float, float]  # times to the first episode or action, and to the end, s
 
 
 def measure_startup(
     plan: EvaluationPlan, peers_python: Path, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Measure all ways; returns plain JSON values. vla-eval is in `skipped`, with the reason, if
-    it cannot run here.
+    """Measure all commands, and return plain JSON values. vla-eval is in `skipped`, with the
+    reason, if it cannot run here.
     """
     found, skipped, _ = peer_clients([PEER], peers_python)
     rounds: dict[str, list[Seconds]] = {}
@@ -94,7 +94,7 @@ def serve_once() -> Seconds:
 
 
 def show_startup(found: Mapping[str, Any]) -> None:
-    """Print a row for each way."""
+    """Print a row for each command."""
     rows = table("", "first s", "whole command s")
     rows.title = (
         f"{found['plan']['episodes']} episodes, {found['cores']} cores, medians of "
@@ -112,7 +112,7 @@ def main(
     peers_python: PeersPython = PYTHON,
     out_file: Out = None,
 ) -> None:
-    """Measure how long evaluations and a server take from cold, ours and vla-eval's."""
+    """Measure how long evaluations and a server take with a cold start, ours and vla-eval's."""
     with errors():
         found = measure_startup(EvaluationPlan(episodes, 0, rounds), peers_python, progress)
     show_startup(found)

@@ -1,10 +1,11 @@
-"""Does what makes a policy fast, or carries its images and actions, cost success?
+"""Tests whether optimizations of a policy, or the transport of its images and actions, cost
+success.
 
-The reference policy runs the same seeds of the tabletop in each way of serving: eager and without
-Ray, which is the standard; compiled, in bfloat16, in 8 bits; in batches; over each transport; with
-JPEG; with each way of executing chunks, at delays; with LoRA merged and apart; after a push; behind
-`upstream` by each protocol. A paired test (McNemar, adjusted by Holm for all ways) compares each
-with the standard, and so does the equality of all actions of an episode, to the bit.
+The reference policy runs the same seeds of the tabletop with each setting: eager and without Ray,
+which is the standard; compiled, in bfloat16, in 8 bits; in batches; over each transport; with JPEG;
+with each mode of executing chunks, at several delays; with merged and separate LoRA; after a push;
+behind `upstream` with each protocol. A paired test (McNemar, adjusted by Holm for all settings)
+compares each setting with the standard. The actions of each episode are also compared bit by bit.
 """
 
 from __future__ import annotations
@@ -46,12 +47,13 @@ from vlagents_ray_learn import Publisher
 
 STANDARD = "eager, in this process"
 APP = "reference"
-CHUNK, EXECUTE = 8, 4  # rows
-TOGETHER = 16  # episodes of a batch
-QUALITIES = (30, 50, 70, 85, 95)  # qualities of JPEG; 85 is the client's
-DELAYS = (0.0, 0.05, 0.15)  # s
-HZ = 20.0  # rate of the clock at those delays: none, one and three ticks
-# What is executed meanwhile: nothing, the old plan, or what the new one continues.
+CHUNK, EXECUTE = 8, 4  # number of rows of a chunk, and number of executed rows
+TOGETHER = 16  # number of episodes of a batch
+QUALITIES = (30, 50, 70, 85, 95)  # qualities of JPEG; 85 is the client's default
+DELAYS = (0.0, 0.05, 0.15)  # delays of an answer, s
+HZ = 20.0  # rate of the clock with these delays, which are zero, one and three ticks
+# The actions that are executed during the delay: none, the old plan, or the rows that the new plan
+# continues.
 LATE: dict[str, dict[str, Any]] = {
     "stop and wait": {"meanwhile": "zero"},
     "async": {},
@@ -85,7 +87,7 @@ _VLAGENTS = {
     "gripper": {"key": "arm/gripper"},
     "instruction": "language_instruction",
 }
-PROTOCOLS: dict[str, tuple[str, Any]] = {  # the URL's scheme and path, and the mapping
+PROTOCOLS: dict[str, tuple[str, Any]] = {  # scheme and path of the URL, and the mapping
     "openpi": ("ws://{host}/openpi", _KEYS),
     "openpi-batch": ("ws://{host}/openpi", _KEYS),
     "roboarena": ("ws://{host}/roboarena", _KEYS),
@@ -98,24 +100,24 @@ PROTOCOLS: dict[str, tuple[str, Any]] = {  # the URL's scheme and path, and the 
 
 @dataclass(frozen=True)
 class Way:
-    """A way of serving the reference policy."""
+    """A setting with which the reference policy is served."""
 
     name: str
-    config: dict[str, Any] = field(default_factory=dict)  # config of the policy
-    adapter: bool = False  # acts with the adapter
-    merged: bool = False  # the checkpoint has the adapter in its weights
-    transport: TransportName | None = None  # None: the policy is in this process
+    config: dict[str, Any] = field(default_factory=dict)  # settings of the policy
+    adapter: bool = False  # whether the adapter is loaded
+    merged: bool = False  # whether the checkpoint has the adapter merged into its weights
+    transport: TransportName | None = None  # transport; None if the policy is in this process
     codec: ImageCodec = _RAW
-    upstream: str | None = None  # a protocol
-    pushed: bool = False  # the server began with other weights
-    together: int = 1  # episodes
+    upstream: str | None = None  # protocol of the upstream
+    pushed: bool = False  # whether the server began with other weights
+    together: int = 1  # number of episodes that run at the same time
     execute: int = EXECUTE
     clock: ClockConfig | None = None
-    equal: bool = False  # to the standard, to the bit
+    equal: bool = False  # whether actions must be bit-identical to the standard
 
 
 def ways() -> list[Way]:
-    """Return all transports and settings, the standard one first."""
+    """Return all transports and settings, the standard first."""
     return [
         Way(STANDARD),
         Way("again", equal=True),
@@ -148,11 +150,13 @@ def ways() -> list[Way]:
 
 @dataclass(frozen=True)
 class Played:
-    """The episodes of a way, by seed: whether solved, and the digest of the actions."""
+    """The episodes with a setting, by seed: whether they were solved, and the digest of their
+    actions.
+    """
 
     way: Way
     episodes: dict[int, tuple[bool, str]]
-    act_ms: float  # median of the episodes' medians, transport included
+    act_ms: float  # median over episodes of the median durations of calls, including transport, ms
 
     @property
     def solved(self) -> int:
@@ -160,7 +164,7 @@ class Played:
 
 
 class Players:
-    """Plays ways, with one server for all of them, which starts with the first that needs it."""
+    """Runs settings with one server, which starts with the first setting that needs it."""
 
     def __init__(self, checkpoint: Path, folder: Path, episodes: int) -> None:
         self._checkpoint, self._folder, self._episodes = (
@@ -169,7 +173,7 @@ class Players:
             episodes,
         )
         self._stack = contextlib.ExitStack()
-        # host:port, and the ports of dialects.
+        # host:port of the server, and ports of the dialects
         self._server: tuple[str, dict[str, int]] | None = None
 
     def __enter__(self) -> Players:
@@ -179,7 +183,9 @@ class Players:
         self._stack.close()
 
     def play(self, way: Way) -> Played:
-        """Play the episodes of a way that have no result in the folder yet, and return all."""
+        """Run the episodes of a setting that have no result in the folder yet, and return all
+        episodes.
+        """
         cameras: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
         suite = SuiteConfig(
             envs=["tabletop"],
@@ -241,7 +247,7 @@ class Players:
                 "gr00t": {"mapping": _GR00T, "port": ports["gr00t"]},
                 "vlagents": {"port": ports["vlagents"]},
             }
-            batch = {"max_size": TOGETHER}  # a session that acts alone is a batch of one
+            batch = {"max_size": TOGETHER}  # a single request of a session is a batch of one
             document = deployment(
                 "reference", config=self._config(Way(STANDARD)), batch=batch, dialects=dialects
             )
@@ -255,7 +261,7 @@ class Players:
             return {name: np.array(value) for name, value in read_values(file).items()}
 
     def _push(self) -> None:
-        """Push other weights, then those of the checkpoint."""
+        """Push other weights, then the checkpoint's weights."""
         values = self._weights()
         with Publisher(f"serve://{APP}") as learner:
             learner.push({name: -value for name, value in values.items()}, pin=True)
@@ -299,8 +305,8 @@ class Players:
 
 
 def compared(found: Sequence[Played]) -> list[dict[str, Any]]:
-    """Return a row for each way: its rate, its difference from the first, and its equal
-    episodes.
+    """Return a row for each setting: its rate, the difference from the first setting, and the
+    number of equal episodes.
     """
     standard = found[0]
     pairs = [_pairs(one, standard) for one in found]
@@ -325,8 +331,8 @@ def compared(found: Sequence[Played]) -> list[dict[str, Any]]:
 
 
 def shown(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the table for the terminal; that of the documentation is made by
-    tests/support/tables.py.
+    """Return the table for the terminal; tests/support/tables.py makes the table for the
+    documentation.
     """
     found = table("way", "success, %", "difference", "p", "equal", "ms an act")
     for row in rows:
@@ -355,15 +361,20 @@ def main(
         Path, typer.Option(help="Folder of the reference policy's weights.")
     ] = Path("examples/reference/checkpoint"),
     folder: Annotated[
-        Path, typer.Option("--out", help="Folder of the results; what it has is not played again.")
+        Path,
+        typer.Option(
+            "--out", help="Folder of the results; episodes with a result are not run again."
+        ),
     ] = Path("runs/success"),
-    episodes: Annotated[int, typer.Option(min=1, help="Of each way.")] = 500,
+    episodes: Annotated[
+        int, typer.Option(min=1, help="Number of episodes with each setting.")
+    ] = 500,
     only: Annotated[
-        str, typer.Option(help="Ways, with semicolons between them; default: all.")
+        str, typer.Option(help="Settings, separated by semicolons; default: all.")
     ] = "",
     out_file: Out = None,
 ) -> None:
-    """Play every way, and print the table."""
+    """Run every setting, and print the table."""
     with errors(), Players(checkpoint, folder, episodes) as players:
         chosen = [one.strip() for one in only.split(";")] if only else [way.name for way in ways()]
         if unknown := set(chosen) - {way.name for way in ways()}:

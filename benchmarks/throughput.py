@@ -1,10 +1,11 @@
-"""Actions a second that many clients get from one replica, against those of the policy alone.
+"""Measures the actions per second that many clients receive from one replica, compared with those
+of the policy alone.
 
 The default policy takes 20 ms for a batch and 1 ms for each observation in it, without using the
 CPU: with 16 in a batch, 444 actions a second are the ideal. Any other policy is measured bare in
-the same run. All transports take turns. A robot among simulations, which acts at random moments, is
-also measured. So are other policy servers, which compute the same policy, also in batches of at
-most 16 if they can.
+the same run. All transports alternate. A robot that sends requests at random times among
+simulations is also measured. Other policy servers are measured with the same policy, in batches of
+at most 16 if they support batches.
 """
 
 from __future__ import annotations
@@ -50,8 +51,9 @@ from vlagents_ray_cluster.tune.measured_policy import rate_of
 DEFAULT_TRANSPORTS = ("plasma", "handle", "shm", "websocket")
 BASE_MS, PER_ITEM_MS = 20.0, 1.0
 SLOW_NOOP = ("noop", {"base_ms": BASE_MS, "per_item_ms": PER_ITEM_MS})
-WITHOUT_GAIN = {"base_ms": 0.0, "per_item_ms": 5.0}  # a policy for which a batch is no faster
-_PROCESSES = 4  # shared by the clients, besides the robot's
+# Settings of a policy for which a batch is no faster.
+WITHOUT_GAIN = {"base_ms": 0.0, "per_item_ms": 5.0}
+_PROCESSES = 4  # number of processes that share the clients, in addition to the robot's process
 _WARM_S = 0.5
 _LATE_S = 60.0
 _BARE = "benchmarks.bare_policy"
@@ -63,20 +65,21 @@ class ThroughputPlan:
 
     policy: str = SLOW_NOOP[0]
     config: Mapping[str, Any] = field(default_factory=lambda: SLOW_NOOP[1])
-    num_gpus: float = 0  # that Ray gives to the replica
+    num_gpus: float = 0  # number of GPUs that Ray assigns to the replica
     batch: int = 16
-    clients: Sequence[int] = (1, 2, 4, 8, 16, 32)  # the last, the most, is measured in each round
-    seconds: float = 2.0  # seconds of each measurement
+    # Numbers of clients, ascending; the last one is measured in each round.
+    clients: Sequence[int] = (1, 2, 4, 8, 16, 32)
+    seconds: float = 2.0  # duration of each measurement, s
     rounds: int = 3
     robot_seconds: float = 10.0
     transports: Sequence[str] = DEFAULT_TRANSPORTS
-    peers: Sequence[str] = ()  # names of `peers.PEERS`, or "all"; they need the policy `noop`
+    peers: Sequence[str] = ()  # names of `peers.PEERS`, or "all", which need the policy `noop`
     peers_python: Path = others.PYTHON
 
     @property
     def ideal(self) -> Callable[[int], float] | None:
-        """The actions a second of K clients if only the policy took time; None if that must be
-        measured.
+        """The actions per second of K clients if only the policy took time; None if this rate must
+        be measured.
         """
         if self.policy != "noop":
             return None
@@ -92,8 +95,8 @@ class ThroughputPlan:
 def measure_throughput(
     plan: ThroughputPlan, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Measure the plan, all fleets in turns, in a new random order in each round; returns plain
-    JSON values.
+    """Measure the plan, with all fleets in a new random order in each round, and return plain JSON
+    values.
     """
     found, skipped = own_clients(plan.transports)
     chosen = _one_each(found)
@@ -161,7 +164,7 @@ def measure_throughput(
 class _Turns:
     """The calls of a fleet."""
 
-    calls: dict[int, list[list[list[Call]]]]  # by number of clients, round and client
+    calls: dict[int, list[list[list[Call]]]]  # calls by number of clients, round and client
     robot: list[Call]
 
 
@@ -175,15 +178,15 @@ class _Part:
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """All clients of one transport or peer: one robot in the first part, simulations in the
-    others, if any.
+    """All clients of one transport or peer: one robot in the first part, and simulations in the
+    other parts, if there are any.
     """
 
     parts: Sequence[_Part]
     turn: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
 
     def run(self, robots: int, simulations: int, seconds: float) -> list[list[Call]]:
-        """Run clients for `seconds`; returns the calls of each, the robot first."""
+        """Run clients for `seconds`, and return the calls of each client, the robot first."""
         counts = _shares(simulations, len(self.parts) - 1) if self.parts[1:] else [simulations]
         shares = [(robots, 0)] * bool(self.parts[1:]) + [(0, count) for count in counts]
         shares[0] = (robots, shares[0][1])
@@ -217,8 +220,8 @@ def peer_fleet(
     obs: Path,
     running: dict[str, others.PeerServer],
 ) -> Iterator[Fleet]:
-    """Start a peer's server, unless `running` has one that it shares, and its clients, within a
-    context.
+    """Start a peer's clients, and its server unless `running` has one that the peer shares, within
+    a context.
     """
     most = max(plan.clients)
     policy = {name: float(plan.config.get(name, 0.0)) for name in ("base_ms", "per_item_ms")} | {
@@ -279,7 +282,7 @@ def _actor(client: OwnClient, url: str, robots: int, simulations: int) -> Iterat
             lambda pending, late: ray.get(pending, timeout=late),
         )
     finally:
-        # `ready` has raised the reason if it never connected.
+        # If the client never connected, `ready` has raised the reason.
         with contextlib.suppress(ray.exceptions.RayError):
             ray.get(actor.close.remote(), timeout=START_S)
         ray.kill(actor)
@@ -291,18 +294,18 @@ def _bare(plan: ThroughputPlan) -> Iterator[LineProcess]:
     with LineProcess(
         "the bare policy", [sys.executable, "-m", _BARE, settings], our_environment()
     ) as child:
-        child.read(10 * START_S)  # it may load weights
+        child.read(10 * START_S)  # the child may load weights
         yield child
 
 
 def _shares(clients: int, parts: int) -> list[int]:
-    """Split clients as evenly as possible; the first parts have one more."""
+    """Split clients as evenly as possible; the first parts may have one client more."""
     return [clients // parts + (i < clients % parts) for i in range(parts)]
 
 
 def _one_each(found: Sequence[OwnClient]) -> list[OwnClient]:
-    """Choose one client for each transport: preferably not an actor; over networks, with the
-    default codec.
+    """Choose one client for each transport: preferably not an actor, and over networks the client
+    with the default codec.
     """
     first: dict[str, OwnClient] = {}
     for one in found:
@@ -335,7 +338,7 @@ def _point(
         "rounds": rates,
         "ci95": mean_interval(rates),
         "of_ideal": rate / plan.ideal(clients) if plan.ideal else None,
-        # A batch counts once for each of its members: the harmonic mean undoes that.
+        # A batch counts once for each of its members; the harmonic mean corrects this.
         "mean_batch": len(flat) / sum(1 / size for *_, size in flat) if flat else None,
         "p50_ms": float(np.median([call[1] for call in flat])) if flat else None,
         "p99_ms": float(np.quantile([call[1] for call in flat], 0.99)) if flat else None,
@@ -343,8 +346,8 @@ def _point(
 
 
 def _waiting(calls: Sequence[Call]) -> dict[str, Any] | None:
-    """Return the robot's round trips, and its waiting time without the inference; None without a
-    call.
+    """Return the robot's round trips, and its waiting times without the inference; None if there
+    was no call.
     """
     if not calls:
         return None
@@ -362,30 +365,38 @@ def _waiting(calls: Sequence[Call]) -> dict[str, Any] | None:
 
 def main(
     transports: Annotated[
-        str, typer.Option(help="With commas between them.")
+        str, typer.Option(help="Transports, separated by commas.")
     ] = "plasma,handle,shm,websocket",
     clients: Annotated[
-        str, typer.Option(help="Numbers; the largest is compared with the ideal.")
+        str,
+        typer.Option(
+            help="Numbers of clients, separated by commas; the largest is compared with the ideal."
+        ),
     ] = "1,2,4,8,16,32",
     batch: Annotated[
-        int, typer.Option(min=1, help="Observations in one forward pass, at most.")
+        int, typer.Option(min=1, help="Maximum number of observations in one forward pass.")
     ] = 16,
     seconds: Seconds = 2.0,
     rounds: Rounds = 3,
     robot_seconds: Annotated[
-        float, typer.Option(min=0, help="How long a robot is watched; 0: not at all.")
+        float,
+        typer.Option(
+            min=0, help="Duration of the measurement of a robot, in seconds; 0: no measurement."
+        ),
     ] = 10.0,
     policy: Annotated[
-        str | None, typer.Option(help="Default: noop, 20 ms + 1 ms an observation.")
+        str | None, typer.Option(help="Policy; default: noop, with 20 ms + 1 ms per observation.")
     ] = None,
     settings: Set = [],  # noqa: B006
-    num_gpus: Annotated[float, typer.Option(min=0, help="That Ray gives to the replica.")] = 0.0,
+    num_gpus: Annotated[
+        float, typer.Option(min=0, help="Number of GPUs that Ray assigns to the replica.")
+    ] = 0.0,
     peers: others.Peers = "",
     peers_python: others.PeersPython = others.PYTHON,
     out_file: Out = None,
 ) -> None:
-    """Measure actions a second of many clients on one replica, against the ideal, or the bare
-    policy.
+    """Measure actions per second of many clients on one replica, compared with the ideal, or with
+    the bare policy.
     """
     with errors():
         origin = measured_on("python -m benchmarks.throughput")

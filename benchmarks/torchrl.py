@@ -1,10 +1,10 @@
-"""TorchRL's own VLA recipe, GRPO on its toy environment, with its inference server and with this
-one, interleaved.
+"""Runs TorchRL's own VLA recipe, GRPO on its toy environment, with TorchRL's inference server and
+with our server, interleaved.
 
 The recipe is `sota-implementations/vla_grpo` of a checkout of TorchRL (github.com/pytorch/rl),
-copied to a temporary folder; with this server, its `utils.py` has one more line. Success is that of
-the recipe's last greedy evaluation; the intervals are Student's over the seeds, as its episodes
-share the weights of a seed.
+copied to a temporary folder; for our server, its `utils.py` has one more line. Success is the rate
+of the recipe's last greedy evaluation. The intervals use Student's t over the seeds, as the
+episodes of a seed share the same weights.
 """
 
 from __future__ import annotations
@@ -28,15 +28,17 @@ from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 
 RECIPE = Path("sota-implementations/vla_grpo")
-IMPORT = "from torchrl.weight_update import WeightStrategy\n"  # the last import of its utils.py
+# The last import of the recipe's utils.py.
+IMPORT = "from torchrl.weight_update import WeightStrategy\n"
 LINE = (
     "from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer, "
     "ServerAddress as MPTransport\n"
 )
 SERVERS = {"TorchRL's server": "", "this server": LINE}
-PYTHON = Path(".venv-torchrl/bin/python")  # made by `make environments FAMILIES=torchrl`
+# Python of the environment that `make environments FAMILIES=torchrl` makes.
+PYTHON = Path(".venv-torchrl/bin/python")
 _FINAL = re.compile(r"Final greedy success rate: (\d\.\d+)")
-# Student's quantile, for 2 to 10 seeds.
+# Student's quantiles for 2 to 10 seeds.
 _T_95 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
@@ -61,13 +63,14 @@ def play(program: Path, python: Path, seed: int, words: Sequence[str] = ()) -> d
     """Run the recipe without a logger and without checkpoints.
 
     Args:
-        program: Its `vla-grpo.py`.
+        program: The recipe's `vla-grpo.py`.
         python: An interpreter with TorchRL and this package.
-        seed: Of environments and initial weights.
+        seed: The seed of environments and initial weights.
         words: Further settings, `NAME=VALUE` of Hydra.
 
     Returns:
-        `success`, the rate of the last evaluation, and `seconds`, of the whole program.
+        `success`, the rate of the last evaluation, and `seconds`, the duration of the whole
+        program.
     """
     settings = [
         f"env.seed={seed}",
@@ -75,7 +78,7 @@ def play(program: Path, python: Path, seed: int, words: Sequence[str] = ()) -> d
         "checkpoint.save_iter=0",
         f"hydra.run.dir={program.parent}/run",
     ]
-    # As TorchRL's own test of the recipe.
+    # The same settings as in TorchRL's own test of the recipe.
     environment = os.environ | {"COMPOSITE_LP_AGGREGATE": "0"}
     begun = time.perf_counter()
     done = subprocess.run(
@@ -101,7 +104,7 @@ def compare(
     words: Sequence[str],
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Run the recipe with each server, seed by seed; returns plain JSON values."""
+    """Run the recipe with each server, seed by seed, and return plain JSON values."""
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in SERVERS}
     with tempfile.TemporaryDirectory() as scratch:
         programs = {
@@ -109,7 +112,7 @@ def compare(
             for i, name in enumerate(SERVERS)
         }
         for seed in range(seeds):
-            # Each is first as often as the other.
+            # The order alternates, so that each server is first equally often.
             for name in list(SERVERS)[:: 1 if seed % 2 == 0 else -1]:
                 runs[name].append(play(programs[name], python, seed, words))
                 progress(f"seed {seed}, {name}: {runs[name][-1]}")
@@ -117,7 +120,7 @@ def compare(
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the mean and the bounds of its 95 % interval by Student's t; 2 to 10 values."""
+    """Return the mean of 2 to 10 values and the bounds of its 95 % interval with Student's t."""
     mean, half = (
         statistics.fmean(values),
         _T_95[len(values) - 2] * statistics.stdev(values) / math.sqrt(len(values)),
@@ -160,10 +163,14 @@ def main(
         list[str], typer.Argument(help="Settings of the recipe, such as collector.total_iters=50.")
     ] = [],  # noqa: B006
     seeds: Annotated[int, typer.Option(min=2, max=10)] = 5,
-    python: Annotated[Path, typer.Option(help="With TorchRL and this package.")] = PYTHON,
+    python: Annotated[
+        Path, typer.Option(help="Python interpreter with TorchRL and this package.")
+    ] = PYTHON,
     out_file: Out = None,
 ) -> None:
-    """Compare success and time of TorchRL's recipe with its inference server and with this one."""
+    """Compare success and time of TorchRL's recipe with its own inference server and with our
+    server.
+    """
     with errors():
         found = compare(source, python.absolute(), seeds, words, progress)
     show(found)

@@ -22,7 +22,7 @@ from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import policy_class
 
-_TIMEOUT_S = 0.02  # longest wait of its server for a whole batch
+_TIMEOUT_S = 0.02  # maximum time for which the server waits for a whole batch, s
 
 
 class TorchTabletop(EnvBase):  # type: ignore[misc]
@@ -99,21 +99,21 @@ def rate(
     whole_batches: bool,
     images: bool,
 ) -> float:
-    """Return the steps a second of TorchRL's collector. Call it in a separate process, since its
-    threads never idle.
+    """Return the steps per second of TorchRL's collector. Call this function in a separate process,
+    since the collector's threads never idle.
 
     Args:
         policy: The policy's name.
-        config: Its settings.
+        config: The policy's settings.
         options: The options of the environments.
-        episodes: Episodes that are measured, a multiple of all environments.
-        workers: Processes of environments.
-        num_envs: Environments of each of these.
+        episodes: Number of measured episodes, a multiple of the number of environments.
+        workers: Number of processes with environments.
+        num_envs: Number of environments in each process.
         grouped: Whether a process holds `num_envs` environments, which the coordinator in this
             process steps; if not, each environment has its own process, which calls the server's
             process itself.
         whole_batches: Whether the server waits for the requests of all environments.
-        images: Whether the policy gets the images.
+        images: Whether the policy receives the images.
     """
     total, steps = workers * num_envs, Tabletop(**options).max_steps
     server = InferenceServerConfig(
@@ -135,7 +135,7 @@ def rate(
     )
     try:
         batches = iter(collector)
-        next(batches)  # processes start
+        next(batches)  # starts the processes
         begun = time.perf_counter()
         frames: int = sum(next(batches).numel() for _ in range(episodes // total))
         return frames / (time.perf_counter() - begun)

@@ -1,9 +1,9 @@
-"""Overhead of `upstream` over another policy server: one `act`, directly and through us,
-interleaved.
+"""Measures the overhead of `upstream` over another policy server: one `act`, directly and through
+our code, interleaved.
 
-The server has openpi's protocol and answers at once, so that only the transport takes time. It is
-called like openpi's own client does, by the policy `upstream` as from our batch queue, and through
-a whole server of ours.
+The server has openpi's protocol and answers immediately, so that only the transport takes time. It
+is called in three ways: like openpi's own client, with the policy `upstream` as our batch queue
+calls it, and through a whole server of ours.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ _ACTIONS = np.zeros((10, 7))
 def measure_upstream(
     calls: int, size: int, whole: bool, progress: Callable[[str], None] = lambda _: None
 ) -> RoundTripsOfAll:
-    """Measure `calls` acts by each path.
+    """Measure `calls` calls over each path.
 
     Args:
-        calls: The number of acts by each path.
+        calls: The number of calls over each path.
         size: Height and width of the two cameras' images, pixels.
         whole: Whether a whole server of ours, which starts Ray, is also measured.
         progress: Called with a line for each part of the measurement.
@@ -53,7 +53,7 @@ def measure_upstream(
     obs = _observation(size)
     with contextlib.ExitStack() as stack:
         url = stack.enter_context(_serving())
-        queue = _Queue(url, obs, stack)  # first, as it waits until the server answers
+        queue = _Queue(url, obs, stack)  # called first, as it waits until the server answers
         drivers: dict[str, _Driver] = {DIRECT: stack.enter_context(_Direct(url, obs)), QUEUE: queue}
         if whole:
             drivers[SERVER] = _Server(url, obs, stack)
@@ -63,7 +63,7 @@ def measure_upstream(
 
 
 class _Driver:
-    """Makes calls by one path."""
+    """Makes calls over one path."""
 
     call: Callable[[], Any]
 
@@ -72,7 +72,7 @@ class _Driver:
         return {}
 
     def measure(self, calls: int) -> list[float]:
-        """Make calls; returns their durations, ms."""
+        """Make calls, and return their durations, ms."""
         taken = []
         for _ in range(calls):
             begun = time.perf_counter()
@@ -104,7 +104,7 @@ class _Direct(_Driver, contextlib.ExitStack):
 
 
 class _Queue(_Driver):
-    """The policy, called as an engine calls it."""
+    """Calls the policy `upstream` as an engine does."""
 
     def __init__(self, url: str, obs: Obs, stack: contextlib.ExitStack) -> None:
         agent = stack.enter_context(Upstream.from_config(_settings(url)))
@@ -122,7 +122,7 @@ class _Queue(_Driver):
 
 
 class _Server(_Driver):
-    """A server of ours in front of the other one, and a client in this process."""
+    """A server of ours in front of the other server, and a client in this process."""
 
     def __init__(self, url: str, obs: Obs, stack: contextlib.ExitStack) -> None:
         server = stack.enter_context(
@@ -170,12 +170,12 @@ def _serve(port: int) -> None:
 
 
 def main(
-    calls: Annotated[int, typer.Option(min=1, help="Acts by each way.")] = 2000,
+    calls: Annotated[int, typer.Option(min=1, help="Number of calls over each path.")] = 2000,
     size: Annotated[
         int, typer.Option(min=1, help="Height and width of the two images, pixels.")
     ] = 224,
     whole: Annotated[
-        bool, typer.Option(help="Measure a whole server of ours, too, which starts Ray.")
+        bool, typer.Option(help="Also measure a whole server of ours, which starts Ray.")
     ] = False,
     out_file: Out = None,
 ) -> None:

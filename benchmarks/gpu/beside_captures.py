@@ -1,7 +1,8 @@
-"""An experiment with graphs that are replayed while other graphs are captured. Inference calls wait
-for the captures of another checkpoint (`CaptureLock`), since waiting for a whole device ends a
-capture on that device. An inference call that only replays graphs does not wait in this way. This
-step tests whether such calls and captures disturb each other without the lock.
+"""An experiment with graphs that are replayed while other graphs are captured.
+
+Inference calls wait for the captures of another checkpoint (`CaptureLock`), since waiting for a
+whole device ends a capture on that device. An inference call that only replays graphs does not wait
+in this way. This step tests whether such calls and captures disturb each other without the lock.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
 """Collects everything that `benchmarks.gpu` needs on a machine without a network in one folder:
+
 `make gpu-pack`. The machine must have Linux on x86-64, Python 3.12, pip, and torch with torchvision
 and numpy, which are not in the folder.
 """

@@ -205,8 +205,10 @@ def one_act(
 
 def neighbours(lab: Lab, measured: BareAndQueued, size: int) -> float:
     """Compare the actions of one episode: at each place of a full batch with different neighbours,
-    and in a batch of its own. At one place the same kernels compute a row, so its neighbours change
-    no bit; alone, other kernels round differently.
+    and in a batch of its own.
+
+    At one place the same kernels compute a row, so its neighbours change no bit; alone, other
+    kernels round differently.
 
     Returns:
         The largest error of an action in a batch, relative to the action that is computed alone.
@@ -474,8 +476,10 @@ def _filled(shapes: Mapping[str, Any], number: float, device: str) -> dict[str, 
 
 def sleep(lab: Lab) -> None:
     """Free the policy's memory for a learner, and restore it; measure the times, and the memory of
-    the process. Finally a learner in another process uses the memory in between, and pushes its
-    values when the policy has woken, as in an iteration of reinforcement learning.
+    the process.
+
+    Finally a learner in another process uses the memory in between, and pushes its values when the
+    policy has woken, as in an iteration of reinforcement learning.
     """
     torch = require("torch")
 

@@ -1,10 +1,11 @@
 """Other policy servers, in their own processes and Python environments.
 
 A `<name>_peer.py` is a script, run by its path with a peer's Python: it imports the peer's
-packages, numpy, the standard library and `peer.py` beside it, never `vlagents_ray`. `serve` is the
-peer's server with a policy that does nothing, or sleeps; `drive` and `load` are its own clients,
-with the line protocol of `peer.py`. `evaluate` is a whole evaluation, if the peer has one: only
-there the script imports the environment that all systems play (`benchmarks/environments.py`).
+packages, numpy, the standard library and `peer.py` in the same folder, never `vlagents_ray`.
+`serve` is the peer's server with a policy that does nothing, or sleeps; `drive` and `load` are the
+peer's own clients, with the line protocol of `peer.py`. `evaluate` is a whole evaluation, if the
+peer has evaluations: only then the script imports the environment that all systems run
+(`benchmarks/environments.py`).
 """
 
 from __future__ import annotations
@@ -32,13 +33,14 @@ from vlagents_ray_cluster.tune.line_process import LineProcess
 
 SCRIPTS = Path(__file__).parent
 REQUIREMENTS = SCRIPTS / "requirements.txt"
-# The end of a second environment's name.
+# The suffix of the name of a second environment.
 TORCH, TORCH_REQUIREMENTS = "-torch", SCRIPTS / "requirements-torch.txt"
-CPU = requirements_file("lerobot").with_suffix(".cpu.txt")  # what LeRobot gets without a GPU
+# Version of torch that LeRobot gets without a GPU.
+CPU = requirements_file("lerobot").with_suffix(".cpu.txt")
 FOLDER = Path(".venv-peers")
 PYTHON = FOLDER / "bin" / "python"
 
-# Options of the measurements.
+# Options of the measurements
 Peers = Annotated[
     str,
     typer.Option(
@@ -62,20 +64,22 @@ class PeerClient:
     """A peer's own client to its own server."""
 
     name: str
-    peer: str  # its name for users
+    peer: str  # the peer's name for users
     script: str
     mode: str
-    distributions: tuple[str, ...]  # that must be installed
-    environment: str = ""  # or `TORCH`
-    several: bool = True  # whether its server has several clients at once
-    server: bool = True  # whether its server is a separate process
-    one_process: bool = False  # whether all its clients must be in one process
-    # Whether its idle server takes whole cores, so that it is stopped between turns.
+    distributions: tuple[str, ...]  # distributions that must be installed
+    environment: str = ""  # suffix of the environment's name: "" or `TORCH`
+    several: bool = True  # whether the peer's server can have several clients at the same time
+    server: bool = True  # whether the peer's server is a separate process
+    one_process: bool = False  # whether all the peer's clients must be in one process
+    # Whether the idle server uses whole cores, so that it is stopped between turns.
     polls: bool = False
-    shares: bool = False  # whether the clients of its script share a server
+    shares: bool = False  # whether the clients of the peer's script share a server
 
     def python(self, python: Path) -> Path:
-        """Return the Python of its environment, where `python` is that of the first."""
+        """Return the Python of the peer's environment, given the Python of the first
+        environment.
+        """
         folder = python.absolute().parents[1]
         return (
             folder.with_name(folder.name + self.environment) / "bin" / python.name
@@ -84,7 +88,7 @@ class PeerClient:
         )
 
     def command(self, python: Path) -> list[str]:
-        """Return the command that runs its script."""
+        """Return the command that runs the peer's script."""
         return [str(self.python(python)), str(SCRIPTS / self.script)]
 
 
@@ -143,14 +147,15 @@ PEER_CLIENTS = (
     ),
 )
 PEERS = tuple(dict.fromkeys(one.peer for one in PEER_CLIENTS))
-Policy = Mapping[str, float]  # arguments of `peer.Policy`
+Policy = Mapping[str, float]  # arguments of the peer's `peer.Policy`
 _NO_STATISTICS = "RAY_USAGE_STATS_ENABLED"
-READY_S = 450.0  # some import torch, or start Ray, several processes at once
+# Time limit of a start, s, as some peers import torch, or start Ray, in several processes at once.
+READY_S = 450.0
 
 
 def alone() -> dict[str, str | None]:
-    """Return the changes of a peer's environment variables: none of ours, as those of a running
-    server's HAProxy.
+    """Return the changes of a peer's environment variables, which remove ours, such as those of a
+    running server's HAProxy.
     """
     ours = [
         name
@@ -163,7 +168,7 @@ def alone() -> dict[str, str | None]:
 def peer_clients(
     names: Sequence[str], python: Path
 ) -> tuple[list[PeerClient], dict[str, str], dict[str, str]]:
-    """Return the clients of the peers in `names` (or "all"), the reasons for skipped ones, and
+    """Return the clients of the peers in `names` (or "all"), the reasons for skipped peers, and the
     installed versions.
     """
     wanted = PEERS if "all" in names else tuple(names)
@@ -194,7 +199,7 @@ def peer_clients(
 
 
 def installed(python: Path, distributions: Sequence[str]) -> dict[str, str]:
-    """Return the versions of the distributions that `python` has."""
+    """Return the versions of the distributions that are installed for `python`."""
     code = (
         "import importlib.metadata as m, json, sys\nfound = {}\nfor name in sys.argv[1:]:\n"
         "    try: found[name] = m.version(name)\n    except m.PackageNotFoundError: "
@@ -216,12 +221,13 @@ class PeerServer:
     """A peer's server."""
 
     address: tuple[str, str]  # host and port
-    process: LineProcess | None  # None: the clients' process starts it
+    # The server's process; None if the clients' process starts the server.
+    process: LineProcess | None
     polls: bool
 
     @contextlib.contextmanager
     def turn(self) -> Iterator[None]:
-        """Let a server that polls run within a context, and stop it after."""
+        """Let a polling server run within a context, and stop it afterwards."""
         self.signal(signal.SIGCONT)
         try:
             yield
@@ -231,19 +237,19 @@ class PeerServer:
     def signal(self, number: signal.Signals) -> None:
         """Send a signal to the processes of a server that polls.
 
-        It is not sent to the helper of `multiprocessing`, which waits for the end of a pipe:
-        stopped, it would never see that end, and outlive a killed benchmark.
+        The signal is not sent to the helper process of `multiprocessing`, which waits for the end
+        of a pipe: if the helper were stopped, it would outlive a killed benchmark.
         """
         if not self.polls or self.process is None:
             return
         for pid in (self.process.pid, *descendants(self.process.pid)):
-            with contextlib.suppress(OSError):  # it has ended
+            with contextlib.suppress(OSError):  # the process has ended
                 if b"resource_tracker" not in Path(f"/proc/{pid}/cmdline").read_bytes():
                     os.kill(pid, number)
 
 
 class _PeerDriver(ClientProcess):
-    """A client whose server runs in its turns."""
+    """A client whose server only runs during the client's turns."""
 
     def __init__(self, server: PeerServer, name: str, command: Sequence[str]) -> None:
         super().__init__(name, command, alone())
@@ -268,8 +274,8 @@ def serving(
     *,
     host: str = LOOPBACK,
 ) -> Iterator[PeerServer]:
-    """Run a peer's server within a context, unless `running` has one that it shares: then yield
-    that.
+    """Run a peer's server within a context; if `running` has a server that the peer shares, yield
+    that server instead.
     """
     if client.script in running:
         yield running[client.script]
@@ -300,8 +306,8 @@ def peer_connected(
     host: str = LOOPBACK,
     prefix: Sequence[str] = (),
 ) -> Iterator[ProcessDriver]:
-    """Run a peer's server on `host`, and its client, whose command begins with `prefix`, within
-    a context.
+    """Run a peer's server on `host` and the peer's client within a context; `prefix` precedes the
+    client's command.
     """
     with serving(client, python, running, {}, host=host) as server:
         command = [
@@ -321,8 +327,8 @@ def peer_connected(
 def starters(
     clients: Sequence[PeerClient], python: Path, *, host: str = LOOPBACK, prefix: Sequence[str] = ()
 ) -> dict[str, StartClient]:
-    """Return the starter of each client by its name, for `measure`. They are entered and left as
-    a stack is.
+    """Return the starter of each client by its name, for `measure`. The contexts must be exited in
+    reverse order.
     """
     running: dict[str, PeerServer] = {}
     return {
@@ -336,10 +342,10 @@ def set_up(
     requirements: Path = REQUIREMENTS,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Make an environment, or update it to the pinned versions; returns its Python.
+    """Create an environment, or update it to the pinned versions, and return its Python.
 
-    It has no package of ours, since the peers' packages conflict with them, and a torch for CPUs.
-    Raises `ConfigError` with the end of uv's output if that fails.
+    The environment has no package of ours, since the peers' packages conflict with ours, and its
+    torch is for CPUs. Raises `ConfigError` with the end of uv's output if that fails.
     """
     from vlagents_ray.serve.python_env.create import create, install, require_no_cuda
 

@@ -1,4 +1,4 @@
-"""Install other policy servers, at pinned versions, in two separate Python environments."""
+"""Installs other policy servers, at pinned versions, in two separate Python environments."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""GR00T's protocol, written for this benchmark after its documentation: the package is not on PyPI.
+"""GR00T's protocol, written for this benchmark from GR00T's documentation, as the package is not on
+PyPI.
 
-ZMQ REQ and REP, msgpack, arrays as the bytes of `.npy` files. Like GR00T's, the server answers one
-request at a time.
+It uses ZMQ REQ and REP, and msgpack with arrays as the bytes of `.npy` files. Like GR00T's server,
+this server answers one request at a time.
 """
 
 from __future__ import annotations

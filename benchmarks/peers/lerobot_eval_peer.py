@@ -1,10 +1,9 @@
-"""LeRobot: `lerobot-eval` with a policy that does nothing and the environment that all systems
-play.
+"""LeRobot: `lerobot-eval` with a policy that does nothing and the environment that all systems run.
 
-It steps `workers` environments in its own process, one after another, with one call of the policy.
-(Its environments in processes, `--eval.use_async_envs`, end with an error in 0.4.4, which looks for
-`envs` in them.) It always makes videos of the first ten episodes, and resets an environment again
-at an episode's end.
+`lerobot-eval` steps `workers` environments in its own process, one after another, with one call of
+the policy. (Environments in separate processes, `--eval.use_async_envs`, end with an error in
+0.4.4, which expects an attribute `envs`.) It always makes videos of the first ten episodes, and
+resets an environment again at the end of an episode.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ PLAN: dict[str, Any] = json.loads(sys.argv[4])
 
 
 class TimedGym(gym.Env):  # type: ignore[misc]
-    """The environment by Gymnasium's interface, with LeRobot's names."""
+    """The environment with Gymnasium's interface and LeRobot's names."""
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
 
@@ -75,7 +74,7 @@ class TimedGym(gym.Env):  # type: ignore[misc]
 @EnvConfig.register_subclass("timed")
 @dataclass
 class TimedEnvConfig(EnvConfig):
-    """LeRobot's settings of the environment, which it finds as `gym_timed/episodes`."""
+    """LeRobot's settings of the environment, which is registered as `gym_timed/episodes`."""
 
     task: str | None = "episodes"
 
@@ -91,7 +90,7 @@ class TimedEnvConfig(EnvConfig):
 @PreTrainedConfig.register_subclass("nothing")
 @dataclass
 class NothingConfig(PreTrainedConfig):
-    """The settings of the policy: none."""
+    """The settings of the policy, which has none."""
 
     observation_delta_indices = action_delta_indices = reward_delta_indices = None
 
@@ -129,7 +128,9 @@ class NothingPolicy(PreTrainedPolicy):  # type: ignore[misc]
 def make_nothing_pre_post_processors(
     *_: Any, **__: Any
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    """Return processors that do nothing, by the name that LeRobot derives from the policy's."""
+    """Return processors that do nothing. LeRobot derives this function's name from the policy's
+    name.
+    """
     actions = {
         "to_transition": policy_action_to_transition,
         "to_output": transition_to_policy_action,

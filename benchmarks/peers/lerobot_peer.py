@@ -1,9 +1,9 @@
 """LeRobot's asynchronous inference: its gRPC `PolicyServer`, and the calls of its `RobotClient`,
 which needs a robot.
 
-An act is `SendObservations` and then `GetActions`, as its control loop makes them. The server does
-not wait until `inference_latency` has passed, 33 ms by default, and no processors run before and
-after the policy. It has one queue with one place for all clients, so it serves one robot at a time.
+An act consists of the calls `SendObservations` and `GetActions`, as in LeRobot's control loop. The
+server's `inference_latency` (33 ms by default) is 0, and no processors run before and after the
+policy. The server has one queue with one place for all clients, so it serves one robot at a time.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ import numpy as np
 import peer
 import torch
 
-# A torchvision whose build does not fit torch lacks them.
+# A torchvision whose build does not fit torch lacks these operators.
 _OPERATORS = torch.library.Library("torchvision", "FRAGMENT")
 for _name in ("nms", "qnms"):
     _OPERATORS.define(f"{_name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
 from lerobot.async_inference import helpers  # noqa: E402
 
-# Else a folder in the working directory.
+# Without this, LeRobot would create a folder in the working directory.
 helpers.get_logger = functools.partial(helpers.get_logger, log_to_file=False)
 
 from lerobot.async_inference import policy_server  # noqa: E402
@@ -49,7 +49,7 @@ class LerobotPolicy:
         return cls()
 
     def to(self, _device: str) -> None:
-        """Stay where it is."""
+        """Do nothing: the policy stays on its device."""
 
     @property
     def config(self) -> Any:
@@ -63,7 +63,7 @@ class LerobotPolicy:
 
 
 def serve(host: str, port: int, policy: peer.Policy) -> None:
-    """Run LeRobot's server, in which the policy is registered."""
+    """Run LeRobot's server, with the policy registered."""
     LerobotPolicy.policy = policy
     policy_server.SUPPORTED_POLICIES.append(NAME)
     policy_server.get_policy_class = {NAME: LerobotPolicy}.__getitem__

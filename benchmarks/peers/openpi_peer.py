@@ -1,8 +1,9 @@
-"""openpi: its client from PyPI (`openpi-client`), images as raw bytes.
+"""openpi: its client from PyPI (`openpi-client`), with images as raw bytes. openpi's server is not
+on PyPI.
 
-Its server is not on PyPI. This one equals openpi's `WebsocketPolicyServer`: the asyncio server of
-`websockets` without compression or size limit, the metadata first, then msgpack in and out by
-openpi's own `msgpack_numpy`, inference on the event loop, and both timings in the reply.
+The server here works like openpi's `WebsocketPolicyServer`: it uses the asyncio server of
+`websockets` without compression or size limit, sends the metadata first, uses openpi's own
+`msgpack_numpy` for messages, computes on the event loop, and replies with both timings.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ async def handler(
             begun = time.monotonic()
             msgpack_numpy.unpackb(await websocket.recv())
             inference = time.monotonic()
-            # (1, 7), or (chunk, 7).
+            # (1, 7), or (chunk, 7)
             actions = policy().reshape(-1, 7)
             action: dict[str, Any] = {"actions": actions, "policy_timing": {"infer_ms": 0.0}}
             action["server_timing"] = {"infer_ms": (time.monotonic() - inference) * 1000}

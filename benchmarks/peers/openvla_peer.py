@@ -1,10 +1,10 @@
-"""OpenVLA's REST server: FastAPI and uvicorn, `POST /act`, arrays as `json_numpy` writes them.
+"""OpenVLA's REST server: FastAPI and uvicorn, `POST /act`, with arrays as `json_numpy` writes them.
 
-OpenVLA is not on PyPI. This is the server of its `vla-scripts/deploy.py` around a policy that does
-nothing, and the client of its documentation: `requests.post(url, json=...).json()` with
-`json_numpy` patched in, a connection for each call. OpenVLA's own request has one image; here it
-has the benchmark's two, and the joints, as in the fine-tuned forks, so that every server gets the
-same observation.
+OpenVLA is not on PyPI. This module has the server of OpenVLA's `vla-scripts/deploy.py` with a
+policy that does nothing, and the client of OpenVLA's documentation: `requests.post(url,
+json=...).json()` with a patched `json_numpy`, and a connection for each call. OpenVLA's own request
+has one image. Here a request has the benchmark's two images and the joints, as in the fine-tuned
+forks, so that every server receives the same observation.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fastapi.responses import JSONResponse  # noqa: E402
 
 
 def predict_action(policy: peer.Policy, payload: dict[str, Any]) -> JSONResponse:
-    """Answer `POST /act`; FastAPI runs it in its thread pool, like OpenVLA's."""
+    """Answer `POST /act`; FastAPI runs this function in its thread pool, as in OpenVLA's server."""
     double_encoded = "encoded" in payload
     if double_encoded:
         payload = json.loads(payload["encoded"])
@@ -51,7 +51,7 @@ def serve(host: str, port: int, policy: peer.Policy) -> None:
 
 
 def connect(target: peer.Target) -> peer.Client:
-    """Make the client of OpenVLA's documentation."""
+    """Return the client of OpenVLA's documentation."""
     obs = {
         "image": target.arrays["camera_0"],
         "wrist_image": target.arrays["camera_1"],
@@ -60,7 +60,7 @@ def connect(target: peer.Target) -> peer.Client:
     }
 
     def act(obs: dict[str, Any]) -> np.ndarray:
-        action = requests.post(f"http://{target.host}:{target.port}/act", json=obs).json()  # noqa: S113 - as its users
+        action = requests.post(f"http://{target.host}:{target.port}/act", json=obs).json()  # noqa: S113 - as in OpenVLA's documentation
         if not isinstance(action, np.ndarray):
             raise TypeError(f"expected an action, got {action!r}")
         return action

@@ -1,5 +1,5 @@
-"""Common parts of the scripts: the line protocol, the policy, and the end of a process with the
-benchmark.
+"""The common parts of the scripts: the line protocol, the policy, and ending a process when the
+benchmark ends.
 
 It imports only the standard library and numpy, as it runs in other environments.
 """
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from benchmarks.closed_loop import ClosedLoop
     from benchmarks.line_client import obey, timed
     from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
-else:  # the peers' Python has no vlagents_ray: files are loaded by their paths
+else:  # The peers' Python has no vlagents_ray, so files are loaded by their paths.
 
     def _load(path: str) -> ModuleType:
         file = Path(__file__).parents[2] / path
@@ -54,24 +54,25 @@ __all__ = ["Client", "Policy", "Target", "die_with_parent", "run", "wait_for_por
 
 _START_S = 400.0
 
-# Also in processes that a script spawns.
+# This also works in processes that a script spawns.
 if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:
     die_with_parent()
 
 
 class Policy:
-    """Seven numbers for each row of a batch, of which the first is the size of the batch.
+    """A policy that returns seven numbers for each row of a batch; the first is the size of the
+    batch.
 
     A batch of B takes `base_ms + per_item_ms * B`. Only one batch is computed at a time, as on an
     accelerator.
 
     Args:
         base_ms: Duration of a batch of any size, ms.
-        per_item_ms: Further duration of each row, ms.
-        batch: Largest batch.
-        chunk: Actions of an answer.
-        accelerator: A file that is locked during a batch: processes with the same one share an
-            accelerator, which computes for one of them at a time.
+        per_item_ms: Additional duration for each row, ms.
+        batch: Maximum size of a batch.
+        chunk: Number of actions in an answer.
+        accelerator: A file that is locked during a batch. Processes with the same file share an
+            accelerator, which computes for one process at a time.
     """
 
     def __init__(
@@ -87,8 +88,8 @@ class Policy:
         self._busy = threading.Lock()
 
     def __call__(self, rows: int = 1) -> np.ndarray:
-        """Compute a batch; returns (rows, 7) float32, or (rows, chunk, 7) with several actions an
-        answer.
+        """Compute a batch, and return (rows, 7) float32, or (rows, chunk, 7) with several actions
+        in an answer.
         """
         shape = (rows, 7) if self.chunk == 1 else (rows, self.chunk, 7)
         actions = np.zeros(shape, np.float32)
@@ -108,7 +109,7 @@ class Policy:
             yield
 
     def ms(self, rows: int) -> float:
-        """Return the time that a batch takes, ms; 0: none."""
+        """Return the duration of a batch, ms."""
         return self.base_ms + self.per_item_ms * rows if self.base_ms or self.per_item_ms else 0.0
 
     def __reduce__(self) -> tuple[type[Policy], tuple[float, float, int, int, str | None]]:
@@ -123,15 +124,15 @@ class Policy:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A server, and what its clients need."""
+    """The address of a server, and the data that its clients need."""
 
     host: str
     port: int
-    # camera_0, … (H, W, 3) uint8 RGB; joints (7,) float32; gripper () float64.
+    # observation: camera_0, … (H, W, 3) uint8 RGB; joints (7,) float32; gripper () float64
     arrays: Mapping[str, np.ndarray]
     mode: str
     policy: Policy
-    clients: int  # clients of this process
+    clients: int  # number of clients in this process
 
     @property
     def cameras(self) -> dict[str, np.ndarray]:
@@ -145,17 +146,17 @@ class Target:
 
 @dataclass(frozen=True)
 class Client:
-    """One connection. Only `act` is timed: it returns the action that the policy gave, (7,)."""
+    """One connection. Only `act` is timed; it returns the policy's action, (7,)."""
 
     observe: Callable[[], Any]
     act: Callable[[Any], Any]
     close: Callable[[], None] = lambda: None
-    # Each run: number of clients, and its end.
+    # arguments of each run: number of clients, and end, s
     before: Callable[[int, float], None] = lambda _clients, _end: None
 
 
 def end_with_stdin(end: Callable[[], None] = lambda: None) -> None:
-    """End this process, a server, as soon as its standard input ends; before that, call `end`."""
+    """End this process, a server, when its standard input ends, after calling `end`."""
 
     def wait() -> None:
         while os.read(0, 4096):
@@ -176,8 +177,8 @@ def _stdin_has_ended() -> bool:
 
 
 def wait_for_port(host: str, port: int) -> None:
-    """Wait until a server listens; `TimeoutError` after `_START_S`. Ends this process if its input
-    ends.
+    """Wait until a server listens; Raises `TimeoutError` after `_START_S`. Ends this process if its
+    standard input ends.
     """
     deadline = time.monotonic() + _START_S
     while True:
@@ -203,11 +204,11 @@ def run(
     """Run the command of a script.
 
     Its commands are `serve HOST PORT POLICY`; `drive HOST PORT OBS.npz MODE POLICY`, a client that
-    makes calls in its turn; `load … ROBOTS SIMULATIONS`, with the same words before, clients that
-    make load; `evaluate HOST PORT PLAN`, which writes a line when all its episodes are run and
-    all its processes have ended. POLICY and PLAN are JSON. Without `serve`, the clients' process
-    starts its server. `end` ends what the server's process has started, if that does not end with
-    it.
+    makes calls in its turn; `load … ROBOTS SIMULATIONS`, with the same arguments before, clients
+    that make load; `evaluate HOST PORT PLAN`, which writes a line when all its episodes have been
+    run and all its processes have ended. POLICY and PLAN are JSON. Without `serve`, the clients'
+    process starts the server. `end` ends processes that the server's process has started, if they
+    do not end with it.
     """
     die_with_parent()
     out = own_stdout()

@@ -1,8 +1,8 @@
-"""portal: its `BatchServer`, with the batching in a separate process, its default, and its
-`Client`.
+"""portal: its `BatchServer`, with batching in a separate process (the default), and its `Client`.
 
-It waits until a batch is full, however long that takes, so there is a method for each size, and
-clients call the one of their number, or of the largest batch. The server polls without a pause.
+The server waits without limit until a batch is full. There is therefore a method for each batch
+size, and clients call the method for their number, or for the largest batch. The server polls
+without a pause.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 import peer
 import portal
 
-_POLL_S = 0.25  # `Future.wait` can miss the answer that comes as it begins to wait
-_LATE_S = 0.5  # for an answer after the end of a run
+_POLL_S = 0.25  # `Future.wait` can miss an answer that arrives when the wait begins.
+_LATE_S = 0.5  # time for an answer after the end of a run, s
 
 
 def serve(host: str, port: int, policy: peer.Policy) -> None:

@@ -1,9 +1,10 @@
 """Plain Ray Serve, without this project: a deployment with `@serve.batch`, as in Ray's
 documentation.
 
-In mode "http" a client posts a msgpack of raw bytes on a connection that it keeps; in mode "handle"
-it is another driver of the same cluster, with the deployment's handle. `max_ongoing_requests` is
-raised, or no batch would have more than five rows; `batch_wait_timeout_s` is Ray's default, 10 ms.
+In mode "http" a client posts msgpack with raw bytes over a connection that stays open; in mode
+"handle" the client is another driver of the same cluster, with the deployment's handle.
+`max_ongoing_requests` is raised, as otherwise no batch would have more than five rows;
+`batch_wait_timeout_s` is Ray's default, 10 ms.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ import msgpack
 import numpy as np
 import peer
 
-# Ray's default where it starts a cluster, but not where it joins one.
+# This is Ray's default if it starts a cluster, but not if it joins one.
 os.environ.setdefault("RAY_AUTH_MODE", "token")
-# As in a server of ours. By default Ray's workers have a low priority, and hardly start on a busy
-# machine, where Serve ends a proxy that has not started within 5 s.
+# The same setting as in a server of ours. By default Ray's workers have a low priority, and start
+# slowly on a busy machine, where Serve ends a proxy that has not started within 5 s.
 os.environ.setdefault("RAY_worker_niceness", "0")
 os.environ.setdefault("RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S", "60")
 
@@ -71,7 +72,7 @@ def serve(host: str, port: int, policy: peer.Policy) -> None:
 
 
 def _start_ray() -> None:
-    """Start a Ray of this process; try again twice, as its start has fixed time limits."""
+    """Start a Ray cluster for this process; try again twice, as the start has fixed time limits."""
     for attempt in range(1, _ATTEMPTS + 1):
         try:
             ray.init(
@@ -88,8 +89,8 @@ def _start_ray() -> None:
 def _start_proxy(host: str, port: int) -> None:
     """Start Serve's controller and its proxy, which may take minutes on a busy machine.
 
-    Serve gives up after one minute, or when it has replaced the proxy; both go on nevertheless, and
-    the next call finds the controller.
+    Serve's call fails after one minute, or when the proxy has been replaced; controller and proxy
+    continue nevertheless, and the next call finds the controller.
     """
     deadline = time.monotonic() + _START_S
     while True:
@@ -103,7 +104,7 @@ def _start_proxy(host: str, port: int) -> None:
 
 
 def connect(target: peer.Target) -> peer.Client:
-    """Make a client of the mode, once the replica answers."""
+    """Return a client of the mode, once the replica answers."""
     url = f"http://{target.host}:{target.port}/"
     deadline = time.monotonic() + _START_S
     while True:
@@ -112,7 +113,7 @@ def connect(target: peer.Target) -> peer.Client:
             answer.raise_for_status()
             break
         except requests.RequestException:
-            # its proxy resets connections while it learns of the replica
+            # the proxy resets connections until it knows the replica
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.2)

@@ -1,8 +1,8 @@
-"""TorchRL: its `InferenceServer` in a process, by its fastest transport between processes,
+"""TorchRL: its `InferenceServer` in a process, with TorchRL's fastest transport between processes,
 `process_slot`.
 
-Each client has a slot in shared memory. Clients can only be made where the server was started, so
-the process of the clients starts it.
+Each client has a slot in shared memory. Clients can only be created in the process that started the
+server, so the clients' process starts it.
 """
 
 from __future__ import annotations
@@ -50,8 +50,9 @@ def _server(target: peer.Target) -> InferenceServer:
 
 
 def connect(target: peer.Target) -> peer.Client:
-    """Make a client of TorchRL."""
-    (client,) = _server(target).clients(1)  # its `client` returns the same one each time
+    """Return a client of TorchRL."""
+    # TorchRL's own `client` returns the same client each time.
+    (client,) = _server(target).clients(1)
     obs = _observation(target)
     return peer.Client(lambda: obs, lambda obs: client(obs)["action"].numpy())
 

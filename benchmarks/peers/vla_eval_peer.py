@@ -1,11 +1,12 @@
-"""vla-eval: its model server around a policy that does nothing, and its `Connection`.
+"""vla-eval: its model server with a policy that does nothing, and its `Connection`.
 
-Images are sent by its default codec, PNG, unless `mode` names another ("jpeg", "raw").
+Images are sent with vla-eval's default codec, PNG, unless `mode` names another codec ("jpeg",
+"raw").
 
-An evaluation is one model server and a `vla-eval run --no-docker` for each shard, all on one
-recording, and then `vla-eval export`, as in its script for sharded runs. Videos are off, its
-default; images are raw, since compression for a server on the same machine only costs time. `run
-...` and `export ...` are its commands of those names.
+An evaluation is one model server and a `vla-eval run --no-docker` for each shard, all with one
+recording, followed by `vla-eval export`, as in vla-eval's script for sharded runs. Videos are off,
+which is the default; images are raw, since compression for a server on the same machine only costs
+time. `run ...` and `export ...` are vla-eval's commands with these names.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from vla_eval.protocol.numpy_codec import set_image_format
 
 
 class VlaEvalPolicy(PredictModelServer):
-    """A model of vla-eval; it takes batches if the policy does."""
+    """A model of vla-eval; it accepts batches if the policy does."""
 
     def __init__(self, policy: peer.Policy) -> None:
         super().__init__(max_batch_size=policy.batch)
@@ -44,7 +45,7 @@ class VlaEvalPolicy(PredictModelServer):
 
 
 class VlaEvalTimed(StepBenchmark):
-    """The environment that all systems play; each shard imports it by name."""
+    """The environment that all systems run; each shard imports it by name."""
 
     def __init__(self, seed: int, env: dict[str, Any]) -> None:
         from benchmarks.environments import TimedEnv
@@ -99,7 +100,7 @@ def connect(target: peer.Target) -> peer.Client:
 
 
 def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
-    """Start the server, play the shards, and export their results."""
+    """Start the server, run the shards, and export their results."""
     folder = Path(plan["folder"])
     benchmark = {
         "benchmark": "vla_eval_peer:VlaEvalTimed",

@@ -1,14 +1,14 @@
 """vlagents, the paper's own system: its server, and its `RemoteAgent` with mode "shm" or "jpeg".
 
-The policy derives from its `Agent` and calls `super().act`, which decodes the cameras, as its
-documentation requires. Its client sends JPEG with simplejpeg's defaults, quality 85 and 4:4:4. The
-server is that of `vlagents start-server`. Its client changes the observation, so each call gets a
-new one.
+The policy derives from vlagents' `Agent` and calls `super().act`, which decodes the cameras, as
+vlagents' documentation requires. The client sends JPEG with simplejpeg's defaults, quality 85 and
+4:4:4. The server is that of `vlagents start-server`. The client changes the observation, so each
+call gets a new observation.
 
-An evaluation is its `run-eval` with `same_machine`, raw images, and no videos. Each configuration
-has its own process and server, so several processes are several configurations of one environment,
-with consecutive seeds. `start-server ...` is its command of that name, with this file's agent
-registered.
+An evaluation is vlagents' `run-eval` with `same_machine`, raw images, and no videos. Each
+configuration has its own process and server, so several processes are several configurations of one
+environment, with consecutive seeds. `start-server ...` is vlagents' command with this name, with
+this file's agent registered.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class VlagentsPolicy(Agent):
 
 
 class VlagentsTabletop(EvalEnv):
-    """The environment that all systems play."""
+    """The environment that all systems run."""
 
     def do_import(self) -> None:
         from benchmarks.environments import TimedEnv
@@ -59,7 +59,7 @@ class VlagentsTabletop(EvalEnv):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Obs, dict[str, Any]]:
-        # After each episode; its observation is not used, so it costs nothing here.
+        # This is called after each episode; the observation is not used, so it costs nothing here.
         if seed is None:
             return self._last, {}
         obs, info = self.env.reset(seed=seed)
@@ -78,7 +78,7 @@ class VlagentsTabletop(EvalEnv):
             cameras=dict(obs.cameras),
             gripper=obs.gripper,
             xyzrpy=obs.state["xyzrpy"],
-            info={"high_res_cameras": {}},  # the cameras for videos; without the key, all cameras
+            info={"high_res_cameras": {}},  # the cameras for videos; without this key, all cameras
         )
         self._last = Obs(obs={"robot": robot}, language_instruction=self.env.instruction)
         return self._last
@@ -120,9 +120,9 @@ def connect(target: peer.Target) -> peer.Client:
 
 
 def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
-    """Run vlagents' `run-eval`; processes other than the first use the next ports."""
+    """Run vlagents' `run-eval`; further processes use the next ports."""
     folder = Path(plan["folder"])
-    # `run-eval` starts PYTHON -m vlagents start-server ..., which has no agent of ours.
+    # `run-eval` starts PYTHON -m vlagents start-server ..., which does not know our agent.
     server = folder / "python"
     server.write_text(f"#!/bin/sh\nshift 2\nexec '{sys.executable}' '{__file__}' \"$@\"\n")
     server.chmod(0o755)

@@ -1,6 +1,8 @@
 """HIL-SERL with the policy on a server: LeRobot's learner trains, and vlagents_ray's control loop
-is its actor, in place of `python -m lerobot.rl.actor`. `python -m lerobot_policy_vlagents.hilserl
-CONFIG FOLDER` writes the first checkpoint for the server.
+is its actor, in place of `python -m lerobot.rl.actor`.
+
+`python -m lerobot_policy_vlagents.hilserl CONFIG FOLDER` writes the first checkpoint for the
+server.
 """
 
 from __future__ import annotations

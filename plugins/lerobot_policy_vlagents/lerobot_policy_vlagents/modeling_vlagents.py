@@ -398,6 +398,7 @@ def _size(batch: Mapping[str, Any]) -> int:
 
 def _plans(left: torch.Tensor | None, delay: int, size: int) -> list[dict[str, Any]]:
     """Return each session's `Obs.info` for real-time chunking, which is empty without a plan.
+
     LeRobot pads a plan with rows of zeros to the execution horizon. The rows of a plan are actions
     that are not normalised.
     """

@@ -87,7 +87,7 @@ def test_too_few_gpus_are_an_exit_status_and_a_sentence_with_the_missing_ones(fi
     done = CliRunner().invoke(app, ["plan", str(file)])
     assert done.exit_code == 1
     assert "4 GPUs serve " in done.stderr
-    assert " of 904 robots in time; all of them need " in done.stderr
+    assert " of 904 robots in time; all robots need " in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -409,9 +409,11 @@ def _model_plan(demand: Demand, choice: Choice, parts: int) -> ModelPlan:
 
 
 def predicted(use: Use, fullest: ReplicaLoad, costs: CostCurve) -> GroupPlan:
-    """Predict the service of robots by a replica. A robot sends its next request after the share of
-    its plan that the server declares, at the next tick, and not before the last answer has arrived.
-    An overloaded replica answers only a part of the requests that the robots need.
+    """Predict the service of robots by a replica.
+
+    A robot sends its next request after the share of its plan that the server declares, at the next
+    tick, and not before the last answer has arrived. An overloaded replica answers only a part of
+    the requests that the robots need.
     """
     need = use.need
     period_s = 1 / need.hz

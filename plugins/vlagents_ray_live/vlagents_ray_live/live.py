@@ -302,8 +302,10 @@ def _info(info: Mapping[str, Any]) -> dict[str, Any]:
 
 def _owner(image: np.ndarray) -> tuple[object, int]:
     """Return the object whose memory an image keeps alive, and its size in bytes: a small image may
-    be part of a large message. If a client shares the memory, only the image itself counts, as the
-    client keeps the memory in any case.
+    be part of a large message.
+
+    If a client shares the memory, only the image itself counts, as the client keeps the memory in
+    any case.
     """
     owner: Any = image
     while True:

@@ -1,9 +1,11 @@
 """An evaluation in one file, which other people can cite, check, replay in part, and merge with
-their own results. The file is a ZIP archive whose first member lists the other members with their
-digests. An archive may come from a stranger. The list of members is checked before any member is
-read: each name is one that `pack` could have written, so that none leads out of the folder; no
-member is a link; the sizes are bounded, and no member yields more bytes than its declared size.
-Nothing is unpickled or imported. `verification` compares the content.
+their own results.
+
+The file is a ZIP archive whose first member lists the other members with their digests. An archive
+may come from a stranger. The list of members is checked before any member is read: each name is one
+that `pack` could have written, so that none leads out of the folder; no member is a link; the sizes
+are bounded, and no member yields more bytes than its declared size. Nothing is unpickled or
+imported. `verification` compares the content.
 """
 
 from __future__ import annotations
@@ -251,10 +253,11 @@ def _copy(
 
 
 def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
-    """Write the results in `folder` as one file that others can check (`verify`). The bundle
-    contains the present results.db, the differences from the commits, and the trajectories, with
-    which episodes are replayed, but nothing that is computed from these. The database names only
-    files in the bundle, so that the bundle's results can be merged with others.
+    """Write the results in `folder` as one file that others can check (`verify`).
+
+    The bundle contains the present results.db, the differences from the commits, and the
+    trajectories, with which episodes are replayed, but nothing that is computed from these. The
+    database names only files in the bundle, so that the bundle's results can be merged with others.
 
     Args:
         folder: A folder of results, to which an evaluation may be writing; nothing in it is

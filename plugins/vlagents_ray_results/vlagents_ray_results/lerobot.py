@@ -237,7 +237,9 @@ class _Selection:
 @contextmanager
 def _new_folder(path: Path) -> Iterator[Path]:
     """Yield a folder for writing, which is renamed to `path` when it is complete; `path` must be
-    missing or empty. Until then the folder is next to `path`; it is removed if writing fails.
+    missing or empty.
+
+    Until then the folder is next to `path`; it is removed if writing fails.
     """
     path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)

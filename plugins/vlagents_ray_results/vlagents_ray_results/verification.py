@@ -51,9 +51,10 @@ _LENGTH = 80  # maximum number of characters of a value in a finding
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The result of one check. "differs" means that the bundle contradicts itself, or that a replay
-    had another outcome. "other here" means other software or numbers on this machine, which alone
-    do not contradict the bundle.
+    """The result of one check.
+
+    "differs" means that the bundle contradicts itself, or that a replay had another outcome. "other
+    here" means other software or numbers on this machine, which alone do not contradict the bundle.
     """
 
     subject: str
@@ -594,8 +595,9 @@ def _difference(
     recorded: Trajectory, number: int, obs: Obs, outcome: tuple[float, bool] | None
 ) -> float | None:
     """Return the largest difference of the numbers of a step or the reset; None if they are
-    bit-identical. The difference is infinite if names or shapes differ, and 0 if only the success
-    differs.
+    bit-identical.
+
+    The difference is infinite if names or shapes differ, and 0 if only the success differs.
 
     Args:
         recorded: The recording.
@@ -656,8 +658,10 @@ def require_harmless(case: CaseResults) -> None:
 
 def replay_actions(case: CaseResults, episode: Episode, trajectory: Trajectory) -> Replayed:
     """Execute the actions of `trajectory` in the environment of `case`, beginning with the
-    episode's seed. State, gripper, rewards and success are compared bit by bit; images are neither
-    rendered nor compared.
+    episode's seed.
+
+    State, gripper, rewards and success are compared bit by bit; images are neither rendered nor
+    compared.
 
     Raises:
         ConfigError: The environment rejects these options, or is unknown here; also

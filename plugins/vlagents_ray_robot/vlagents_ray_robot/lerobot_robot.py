@@ -149,9 +149,10 @@ class LeRobotRobot:
 
     @functools.cached_property
     def _arms(self) -> list[_Arm]:
-        """The arms that have a bus; the whole robot if not all motors are on these buses. LeRobot's
-        robots with two arms have the attributes `left_arm` and `right_arm`, and the motors' names
-        have the prefixes "left_" and "right_".
+        """The arms that have a bus; the whole robot if not all motors are on these buses.
+
+        LeRobot's robots with two arms have the attributes `left_arm` and `right_arm`, and the
+        motors' names have the prefixes "left_" and "right_".
         """
         whole = [_Arm(self._robot, self.joint_names, list(range(len(self._keys))))]
         if hasattr(self._robot, "bus"):

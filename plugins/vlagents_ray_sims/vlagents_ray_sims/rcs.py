@@ -312,8 +312,9 @@ class Rcs(SimulatorEnv):
         self, config: Any, cameras: Sequence[str] | None, height: int, width: int
     ) -> None:
         """Leave only these cameras in the config of a scene (all if None), with images of this
-        size. The configs of the cameras are copied, so that the scene's own configs keep their
         size.
+
+        The configs of the cameras are copied, so that the scene's own configs keep their size.
         """
         scene_cameras = config.camera_cfgs or {}
         require_cameras(self._name, cameras or (), scene_cameras)

@@ -1,4 +1,5 @@
 """The part of RPyC's protocol for a service with text arguments and results; based on rpyc 6.0.
+
 RPyC allows a peer to access attributes of the server's objects, to call these objects, and to pass
 objects that the server calls back. This reader supports none of that: it identifies the root and
 its methods by number, and accepts only values without references. A peer can therefore only call

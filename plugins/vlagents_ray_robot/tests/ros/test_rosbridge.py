@@ -1,6 +1,8 @@
 """Tests of the rosbridge protocol with recorded messages of a real server, which must also follow
-the rules of the test double. `recorded_rosbridge.jsonl` contains frames of rosbridge_suite (commit
-c1bfc2f of the branch ros2) with ROS 2 Kilted, sent to a client that subscribed without compression.
+the rules of the test double.
+
+`recorded_rosbridge.jsonl` contains frames of rosbridge_suite (commit c1bfc2f of the branch ros2)
+with ROS 2 Kilted, sent to a client that subscribed without compression.
 """
 
 from __future__ import annotations

@@ -126,9 +126,11 @@ class RosSettings:
 
     @property
     def delta(self) -> bool | None:
-        """Whether actions are relative. False if the measured pose stops the robot, as the numbers
-        of an action are then targets. None otherwise: zeros stop both velocities and deltas, and
-        the meaning of a topic's numbers is unknown if it has no stop.
+        """Whether actions are relative.
+
+        False if the measured pose stops the robot, as the numbers of an action are then targets.
+        None otherwise: zeros stop both velocities and deltas, and the meaning of a topic's numbers
+        is unknown if it has no stop.
         """
         stops = {command.stop for command in self.actions} - {NOTHING}
         return False if stops and stops <= self.state.keys() else None
@@ -409,8 +411,9 @@ class TopicReader:
         self._newest = message, time.time()
 
     def refresh(self) -> None:
-        """Decode the newest message, if it is not decoded yet. An unreadable message is ignored, so
-        that the age of the reading grows.
+        """Decode the newest message, if it is not decoded yet.
+
+        An unreadable message is ignored, so that the age of the reading grows.
 
         Raises:
             ConfigError: The first message is unreadable.
