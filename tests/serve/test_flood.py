@@ -324,6 +324,9 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
             (flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 90, 99)
         )
         is_calm = p50[1] < 2 * p50[0] and p90[1] < 2 * max(p90[0], NOISE_MS)
+        if flood.percentile(beside, 50) < flood.percentile(alone_ms[name], 50):
+            # No flood makes a robot faster: something else ran while it was alone.
+            alone_ms[name] = beside
         if is_calm or attempt == ATTEMPTS - 1:
             break
     begun = time.monotonic()

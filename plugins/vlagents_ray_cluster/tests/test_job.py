@@ -4,16 +4,23 @@ server.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import json
 import os
+import signal
 import socket
 import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from eval_fakes import wait_for
 
+from vlagents_ray_cluster.slurm import job
 from vlagents_ray_cluster.slurm.job import (
+    HEAD,
     Allocation,
     Ports,
     as_text,
@@ -163,3 +170,81 @@ def test_the_file_with_the_key_is_its_owners_alone(tmp_path: Path) -> None:
     write(tmp_path / "server.json", {"key": "vlr_x"})
     assert (tmp_path / "server.json").stat().st_mode & 0o777 == 0o600
     assert json.loads((tmp_path / "server.json").read_text()) == {"key": "vlr_x"}
+
+
+# In place of `ray`: it does not start as often as the folder says; then it runs until SIGTERM.
+RAY = """#!/bin/bash
+echo start >>{folder}/attempts
+for word; do case "$word" in --temp-dir=*) files=${{word#--temp-dir=}} ;; esac; done
+if [ "$(wc -l <{folder}/attempts)" -le {failures} ]; then exit 1; fi
+mkdir -p "$files"
+echo 127.0.0.1:1 >"$files/ray_current_cluster"
+trap 'exit 0' TERM
+if [ -n "{ends}" ]; then exit 1; fi
+echo >{folder}/runs
+while :; do sleep 0.02; done
+"""
+
+
+@contextlib.contextmanager
+def running_node(
+    folder: Path, *, failures: int = 0, ends: bool = False
+) -> Iterator[subprocess.Popen[str]]:
+    """Run the program of the first node, with a Ray that fails to start `failures` times."""
+    program = folder / "bin" / "ray"
+    program.parent.mkdir()
+    program.write_text(RAY.format(folder=folder, failures=failures, ends="1" if ends else ""))
+    program.chmod(0o755)
+    environment = os.environ | ENVIRONMENT | {"SLURM_NODEID": "0", HEAD: "127.0.0.1"}
+    environment["PATH"] = f"{program.parent}:{environment['PATH']}"
+    with subprocess.Popen(
+        [sys.executable, "-m", "vlagents_ray_cluster.slurm.job", "node"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def attempts(folder: Path) -> int:
+    return len((folder / "attempts").read_text().splitlines())
+
+
+def test_a_ray_that_does_not_start_on_a_busy_node_is_started_again(tmp_path: Path) -> None:
+    with running_node(tmp_path, failures=2) as process:
+        wait_for((tmp_path / "runs").exists, 60)
+        process.send_signal(signal.SIGTERM)
+        printed, _ = process.communicate(timeout=60)
+    assert (process.returncode, attempts(tmp_path)) == (0, 3)
+    assert "Ray ended with 1 while it started, trying again (attempt 2 of 3)" in printed
+
+
+@pytest.mark.parametrize(
+    ("failures", "number"), [(99, 3), (0, 1)], ids=["never starts", "ends later"]
+)
+def test_a_head_whose_ray_does_not_start_or_ends_later_ends_the_job(
+    failures: int, number: int, tmp_path: Path
+) -> None:
+    with running_node(tmp_path, failures=failures, ends=True) as process:
+        printed, _ = process.communicate(timeout=60)
+    assert (process.returncode, attempts(tmp_path)) == (1, number)
+    assert printed.endswith("Ray ended with 1\n")
+
+
+def test_a_node_that_slurm_ends_between_two_attempts_starts_no_ray(tmp_path: Path) -> None:
+    node = job._Node(Allocation.here(ENVIRONMENT | {"SLURM_NODEID": "0"}), "127.0.0.1")
+    program = tmp_path / "ray"
+    program.write_text("#!/bin/sh\nexec sleep 60\n")
+    program.chmod(0o755)
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        node.ended_by_slurm(),
+    ):
+        patch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+        signal.raise_signal(signal.SIGTERM)
+        status, has_started = node.run_ray()
+    assert (status, has_started) == (-signal.SIGTERM, False)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

@@ -25,10 +25,9 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import urllib.request
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -36,6 +35,7 @@ from typing import Any
 
 from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.ray_tools.session import FILES
+from vlagents_ray.ray_tools.signals import StopRequest, delivered
 
 # Variable with the address of the first node, exported by the job's script.
 HEAD = "VLAGENTS_RAY_HEAD"
@@ -51,6 +51,8 @@ _SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 by
 _NO_DRAIN = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}
 _HEAD_S = 120.0  # time limit until the head listens, s
 _NODES_S = 300.0  # time limit until all nodes have joined, s
+_ATTEMPTS = 3  # to start Ray on a node
+_STARTED = "ray_current_cluster"  # the file in Ray's folder with the address of a started cluster
 # Runs the command line with this Python, whatever PATH contains.
 _COMMAND = "from vlagents_ray.cli import main; main()"
 FILE = "server.json"
@@ -156,35 +158,86 @@ class Allocation:
 def run_node() -> int:
     """Run Ray on this node until the step ends, and remove Ray's files.
 
+    If Ray does not start, the start is tried again: Ray's daemon waits at most 15 s for each of its
+    helpers (ray issue 65983), which can be too short on a busy node.
+
     Returns:
-        The exit status of the step. On the head it is Ray's exit status, unless Slurm has ended the
-        step.
+        The exit status of the step. On the head it is that of Ray, unless Slurm has ended the step.
     """
     allocation = Allocation.here()
     head = os.environ[HEAD]
-    if allocation.node:
-        wait_for_head(head, allocation.ports.gcs)
+    node = _Node(allocation, head)
+    with node.ended_by_slurm():
+        for attempt in range(1, _ATTEMPTS + 1):
+            if allocation.node:
+                wait_for_head(head, allocation.ports.gcs)
+            status, has_started = node.run_ray()
+            if node.terminated.is_set():
+                return 0
+            if status == 0 or has_started or attempt == _ATTEMPTS:
+                break
+            sys.stdout.write(
+                f"Ray ended with {status} while it started, trying again (attempt {attempt + 1} of "
+                f"{_ATTEMPTS})\n"
+            )
+            sys.stdout.flush()
 
-    metrics_port = {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics)}
-    environment = os.environ | metrics_port | _NO_DRAIN
-    terminated = threading.Event()  # Slurm has ended the step
-    with tempfile.TemporaryDirectory(
-        prefix=f"vlr-{allocation.job}-", dir=_SHORT, ignore_cleanup_errors=True
-    ) as folder:
-        ray = subprocess.Popen(allocation.ray_start(head, folder), env=environment)  # noqa: S603 - our own command
-
-        def terminate(_number: int, _frame: FrameType | None) -> None:
-            terminated.set()
-            ray.terminate()
-
-        signal.signal(signal.SIGTERM, terminate)
-        status = ray.wait()
-
-    if terminated.is_set():
-        return 0
     sys.stdout.write(f"Ray ended with {status}\n")
     # The job continues without this node, unless it is the head.
     return 0 if allocation.node else status
+
+
+class _Node:
+    """Ray on this node.
+
+    Args:
+        allocation: The resources of the job on this node.
+        head: The address of the first node.
+    """
+
+    def __init__(self, allocation: Allocation, head: str) -> None:
+        self.terminated = StopRequest()  # Slurm has ended the step
+        self._allocation = allocation
+        self._head = head
+        self._ray: subprocess.Popen[bytes] | None = None
+
+    @contextlib.contextmanager
+    def ended_by_slurm(self) -> Iterator[None]:
+        """End Ray at SIGTERM within the context."""
+        before = signal.signal(signal.SIGTERM, self._terminate)
+        try:
+            with delivered():
+                yield
+        finally:
+            signal.signal(signal.SIGTERM, before)
+
+    def run_ray(self) -> tuple[int, bool]:
+        """Run Ray until it ends.
+
+        Returns:
+            The exit status of Ray, and whether it had started. A node that leaves the job in its
+            first minutes has not: the head that it joined may have failed to start.
+        """
+        metrics_port = {"AUTOSCALER_METRIC_PORT": str(self._allocation.ports.metrics)}
+        environment = os.environ | metrics_port | _NO_DRAIN
+        begun = time.monotonic()
+        with tempfile.TemporaryDirectory(
+            prefix=f"vlr-{self._allocation.job}-", dir=_SHORT, ignore_cleanup_errors=True
+        ) as folder:
+            command = self._allocation.ray_start(self._head, folder)
+            self._ray = subprocess.Popen(command, env=environment)  # noqa: S603 - our own command
+            if self.terminated.is_set():
+                self._ray.terminate()
+            status = self._ray.wait()
+            if self._allocation.node:
+                return status, time.monotonic() - begun > _NODES_S
+            # `ray start` writes this file when all of Ray's processes run.
+            return status, Path(folder, FILES, _STARTED).exists()
+
+    def _terminate(self, _number: int, _frame: FrameType | None) -> None:
+        self.terminated.set()
+        if self._ray is not None:
+            self._ray.terminate()
 
 
 def wait_for_head(host: str, port: int) -> None:
@@ -288,9 +341,12 @@ def wait_for_nodes(address: str, number: int) -> int:
     while not ray.is_initialized():
         try:
             ray.init(address=address, logging_level="ERROR", log_to_driver=False)
-        except (ConnectionError, RuntimeError) as error:  # Ray does not run on this node yet
+        # Ray does not run on this node yet, or ends because it has not started in time. Ray raises
+        # a plain Exception in some of these cases.
+        except Exception as error:  # noqa: BLE001 - see above
             if time.monotonic() > deadline:
                 sys.exit(f"no Ray at {address} in {_NODES_S:g} s: {error}")
+            time.sleep(_POLL_S)
     try:
         while True:
             alive = [node for node in ray.nodes() if node["Alive"]]
