@@ -21,8 +21,11 @@ from typer.testing import CliRunner
 from vlagents_ray import registry
 from vlagents_ray.cli import evaluate as command
 from vlagents_ray.cli import evaluation as run
+from vlagents_ray.cli import policies
 from vlagents_ray.cli.evaluation import forecasts, live_address, print_plan
 from vlagents_ray.cli.main import app
+from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.errors import MissingDependency
 from vlagents_ray.evaluate import (
     EvalConfig,
     OutOfTime,
@@ -35,9 +38,10 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan_jobs
-from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, require_installed, resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
+from vlagents_ray.policies.noop import Noop
 from vlagents_ray.registry import pip_install
 
 WORDS = ["eval", "tabletop", "--policy", "http://127.0.0.1:9"]
@@ -358,3 +362,76 @@ def test_a_time_that_leaves_out_some_cases_is_a_lower_bound(
     play(config(episodes=3, policy_url=url))
     print_plan(config(envs=[LINE, OTHER_LINE], episodes=9, policy_url=url))
     assert ": at least 0:00:0" in " ".join(capsys.readouterr().out.split())
+
+
+class NeedsPackage(Tabletop):
+    """A simulator whose package is not installed in this Python."""
+
+    @classmethod
+    def not_installed(cls) -> str | None:
+        return "physics is not installed; run `vlagents-ray venv create physics`"
+
+
+NEEDS_PACKAGE = f"{__name__}:NeedsPackage"
+
+
+@pytest.mark.parametrize("workers", ["0", "1"])
+def test_a_simulator_that_is_not_installed_is_an_error_before_ray_and_the_policy_start(
+    workers: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """On a loaded machine, Ray and the policy took two minutes to start for this error."""
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    started = []
+    monkeypatch.setattr(policies, "_enter_ray", lambda *_: started.append("ray"))
+    monkeypatch.setattr(Noop, "initialize", lambda *_: started.append("policy"))
+    options = ["--policy", "noop", "--set", "action_dim=4", "--workers", workers]
+    words = ["eval", NEEDS_PACKAGE, *options, "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    assert done.exit_code == 1
+    assert "physics is not installed; run `vlagents-ray venv create physics`" in done.output
+    assert started == []
+
+
+@pytest.mark.parametrize(
+    ("runtime_env", "is_checked"),
+    [
+        ({}, True),
+        ({"env_vars": {"MUJOCO_GL": "egl"}}, True),
+        ({"py_executable": "/envs/physics/bin/python"}, False),
+        ({"env_vars": {"PYTHONPATH": "/physics"}}, False),
+    ],
+)
+def test_simulators_of_workers_with_other_packages_are_not_looked_for_here(
+    runtime_env: dict[str, Any], tmp_path: Path, *, is_checked: bool
+) -> None:
+    config = EvalConfig(
+        policies=[PolicyConfig(source="noop")],
+        suites=[SuiteConfig(envs=[NEEDS_PACKAGE], worker=WorkerConfig(runtime_env=runtime_env))],
+        out=tmp_path,
+    )
+    expected = pytest.raises(MissingDependency, match="venv create physics")
+    with expected if is_checked else contextlib.nullcontext():
+        require_installed(plan_cases(config))
+
+
+def test_a_cluster_may_have_the_simulator_that_this_machine_lacks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class ReachedRayError(Exception):
+        pass
+
+    def enter_ray(*_: object) -> NoReturn:
+        raise ReachedRayError
+
+    monkeypatch.setattr(policies, "_enter_ray", enter_ray)
+    config = EvalConfig(
+        policies=[PolicyConfig(source="noop")],
+        suites=[SuiteConfig(envs=[NEEDS_PACKAGE])],
+        out=tmp_path,
+        workers=1,
+    )
+    with pytest.raises(ReachedRayError), policies.served(config, "ray://head:10001"):
+        pass
+    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
+    with pytest.raises(ReachedRayError), policies.served(config):
+        pass

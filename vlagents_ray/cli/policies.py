@@ -19,7 +19,13 @@ from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError, MalformedMessage, shown
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, chosen_workers, resolve
+from vlagents_ray.evaluate.plan.resolved import (
+    ResolvedPlan,
+    chosen_workers,
+    may_use_cluster,
+    require_installed,
+    resolve,
+)
 from vlagents_ray.evaluate.run import check_results
 from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.interface import Agent
@@ -67,11 +73,13 @@ def served(
         if not on_ray:
             on_ray = chosen_workers(config, plan_cases(config)) > 0
         if on_ray:
+            _require_simulators(config, address)
             _enter_ray(stack, address)
 
         ready, deployments = resolve_policies(config)
         local = None if on_ray else _local_policies(deployments, config.workers)
         if not on_ray and local is None:
+            _require_simulators(config, address)
             _enter_ray(stack)
 
         agents: Agents = {}
@@ -85,6 +93,7 @@ def served(
         if address is None:
             _require_resources(plan, deployments)
         _require_fit(plan, _by_policy(ready, deployments))
+        _require_simulators(config, address)
         check_results(plan)
 
         if local is not None:
@@ -122,6 +131,14 @@ def planned_workers(
     if workers or address is not None or _local_policies(deployments, config.workers) is None:
         return workers or 1
     return 0
+
+
+def _require_simulators(config: EvalConfig, address: str | None) -> None:
+    """Raise `MissingDependency` if a simulator is not installed, unless it may run on another
+    machine, or not at all, as a resumed evaluation may have all results.
+    """
+    if address is None and not may_use_cluster() and not config.resume:
+        require_installed(plan_cases(config))
 
 
 def _require_cluster_workers(config: EvalConfig, address: str | None) -> None:

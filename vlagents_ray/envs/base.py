@@ -171,11 +171,18 @@ class EvalEnv(Environment):
         return None
 
     @classmethod
+    def not_installed(cls) -> str | None:
+        """Return which package of the simulator this Python lacks, with the cure; None if it has
+        all. This is fast, as it neither imports nor starts the simulator.
+        """
+        return None
+
+    @classmethod
     def missing(cls) -> str | None:
         """Return the reason why the simulator cannot run here, with the cure; None if it can
         run.
         """
-        return None
+        return cls.not_installed()
 
     @classmethod
     def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:  # noqa: ARG003

@@ -223,7 +223,7 @@ class Gymnasium(EvalEnv):
         return int(limit)
 
     @classmethod
-    def missing(cls) -> str | None:
+    def not_installed(cls) -> str | None:
         return without(("gymnasium",), pip_install("sim"))
 
     @property
@@ -418,7 +418,7 @@ class PushT(Gymnasium):
         require_known("pusht", task or "image", cls.tasks())
 
     @classmethod
-    def missing(cls) -> str | None:
+    def not_installed(cls) -> str | None:
         return without(("gym_pusht",), pip_install("pusht"))
 
     def _observe(self, nested: Any) -> Obs:

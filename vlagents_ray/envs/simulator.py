@@ -124,12 +124,16 @@ class SimulatorEnv(EvalEnv):
             require_known(cls.suite, task, known)
 
     @classmethod
+    def not_installed(cls) -> str | None:
+        return without(cls.packages, cls.cure)
+
+    @classmethod
     def missing(cls) -> str | None:
         """Return the reason why the simulator cannot run here; None if it can run.
 
         The first call in a process renders one frame in a child process.
         """
-        missing = without(cls.packages, cls.cure)
+        missing = cls.not_installed()
         if missing is not None:
             return missing
         try:

@@ -279,9 +279,13 @@ class Calvin(SimulatorEnv):
         return self._words[self._playing().tasks[min(self._done, TASKS - 1)]]
 
     @classmethod
-    def missing(cls) -> str | None:
+    def not_installed(cls) -> str | None:
         cure = "run `vlagents-ray venv create calvin` and give the evaluation's workers that Python"
-        missing = without(("pybullet", "hydra", "gym", "git", "quaternion"), cure)
+        return without(("pybullet", "hydra", "gym", "git", "quaternion"), cure)
+
+    @classmethod
+    def missing(cls) -> str | None:
+        missing = cls.not_installed()
         if missing is not None:
             return missing
         try:

@@ -340,7 +340,7 @@ class Rcs(SimulatorEnv):
             require_known(cls.suite, task, cls.tasks(), ", or an id, as in 'lab/shelf'")
 
     @classmethod
-    def missing(cls) -> str | None:
+    def not_installed(cls) -> str | None:
         return missing_packages(*cls.packages)
 
     def describe(self) -> dict[str, Any]:

@@ -153,6 +153,10 @@ class Simpler(SimulatorEnv):
         return task_instruction
 
     @classmethod
+    def not_installed(cls) -> str | None:
+        return ManiSkill.not_installed()
+
+    @classmethod
     def missing(cls) -> str | None:
         folder = Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
         return ManiSkill.missing() or _missing_assets(folder)

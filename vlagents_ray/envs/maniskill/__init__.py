@@ -142,13 +142,16 @@ class ManiSkill(SimulatorEnv):
         """Accept every name, since only ManiSkill knows the registered ids."""
 
     @classmethod
+    def not_installed(cls) -> str | None:
+        return without(("mani_skill", "sapien", "gymnasium", "torch"), pip_install("maniskill"))
+
+    @classmethod
     def missing(cls) -> str | None:
         """Return the reason why ManiSkill cannot run here, with the cure; None if it can run.
 
         The first call in a process renders one frame in a child process.
         """
-        modules = ("mani_skill", "sapien", "gymnasium", "torch")
-        missing = without(modules, pip_install("maniskill"))
+        missing = cls.not_installed()
         if missing is not None:
             return missing
 

@@ -5,13 +5,13 @@ configuration.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases, require_envs
 from vlagents_ray.evaluate.plan.config import (
     EpisodeChoice,
@@ -20,9 +20,10 @@ from vlagents_ray.evaluate.plan.config import (
     RecordedImages,
     StopConfig,
     TrackingConfig,
+    WorkerConfig,
 )
 from vlagents_ray.ray_tools.private import node_of_this_process
-from vlagents_ray.registry import registered_class, require_needs
+from vlagents_ray.registry import env_class, registered_class, require_needs
 
 VARIABLES = "env_vars"  # key of Ray's runtime environment
 # Number of planned steps up to which the start of Ray, some seconds, is a large part of the
@@ -162,13 +163,40 @@ def chosen_workers(config: EvalConfig, cases: Sequence[EvalCase]) -> int:
     if config.workers is not None:
         return config.workers
 
-    is_in_cluster = node_of_this_process() is not None or bool(os.environ.get("RAY_ADDRESS"))
+    is_in_cluster = may_use_cluster()
     needs_gpu = any(case.worker.gpus for case in cases)
     steps = 0
     for case in cases:
         limit = case.suite.env_options.get("max_steps")
         steps += case.planned * (limit if isinstance(limit, int) else _STEPS)
     return 1 if reasons or is_in_cluster or needs_gpu or steps > SHORT_STEPS else 0
+
+
+def require_installed(cases: Iterable[EvalCase]) -> None:
+    """Check that this Python has the simulators of the cases whose workers use it, before anything
+    starts.
+
+    Raises:
+        MissingDependency: A package of a simulator is not installed; the message has the cure.
+    """
+    for case in cases:
+        if case.robot is not None or _may_use_other_packages(case.worker):
+            continue
+        reason = env_class(case.env).not_installed()
+        if reason is not None:
+            raise MissingDependency(f"env {case.env!r} cannot run here: {reason}")
+
+
+def _may_use_other_packages(worker: WorkerConfig) -> bool:
+    """Return whether a worker may have other packages than this process."""
+    variables = worker.runtime_env.get(VARIABLES)
+    has_path = isinstance(variables, Mapping) and "PYTHONPATH" in variables
+    return has_path or bool(worker.runtime_env.keys() - {VARIABLES})
+
+
+def may_use_cluster() -> bool:
+    """Return whether Ray would join a running cluster, whose nodes may differ from this one."""
+    return node_of_this_process() is not None or bool(os.environ.get("RAY_ADDRESS"))
 
 
 def _reasons_for_ray(config: EvalConfig, cases: Sequence[EvalCase]) -> list[str]:
