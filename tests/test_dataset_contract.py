@@ -194,7 +194,7 @@ def test_a_rotation_vector_that_passes_pi_is_continuous_and_the_same_rotation(
         Rotation.from_rotvec(vectors).as_matrix() for vectors in (values[:, 1:], seen)
     )
     np.testing.assert_allclose(rotations, expected, atol=1e-5)
-    for one, alone in zip(state, values, strict=True):  # one by one, like a server receives them
+    for one, alone in zip(state, values, strict=True):  # one by one, as a server receives them
         np.testing.assert_array_equal(
             DatasetContract(Contract(), angles={1: centre}).wrapped(one), alone
         )

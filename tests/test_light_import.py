@@ -86,7 +86,7 @@ def test_the_public_names_import_nothing_heavy() -> None:
 
 
 def test_the_help_of_the_commands_needs_neither_arrays_nor_connections() -> None:
-    """A shell waits for it, and so does each command that only reads or writes a file."""
+    """A shell waits for this help, and the other commands load the same modules first."""
     unneeded = {"asyncio", "numpy", "simplejpeg", "websockets", "yaml"} | HEAVY
     assert loaded_by("import vlagents_ray.cli.main") & unneeded == {"pydantic", "rich", "typer"}
 

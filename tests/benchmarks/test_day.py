@@ -19,7 +19,7 @@ def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop(
 ) -> None:
     normal = day.play_day(0, 2 * MINUTES, faults=False, relative=relative, arms=arms)
     assert normal.stops == 0
-    assert normal.moving_s > 100  # of 120 s
+    assert normal.moving_s > 100  # of 120 s in total
     assert normal.held.get("dynamics", 0) < 10, (
         "without a fault the guard rejects hardly any of 6000 actions"
     )

@@ -59,7 +59,7 @@ def zipped(folder: Path) -> Iterator[None]:
 
 
 def renamed(folder: Path) -> Iterator[None]:
-    """Write like orbax does: under another name until the checkpoint is complete."""
+    """Write as orbax does: under another name until the checkpoint is complete."""
     temporary = folder.with_name(f"{folder.name}.orbax-checkpoint-tmp-7")
     yield from in_pieces(temporary / "params" / "array", bytes(300))
     temporary.rename(folder)

@@ -70,7 +70,7 @@ def edit(name: str) -> None:
 
 
 def served(own_weights: str | None) -> dict[str, Any]:
-    """Return the metadata of a server of the policy, like a replica creates them."""
+    """Return the metadata of a server of the policy, as a replica creates them."""
     files = files_named({"checkpoint": "w.npz", "gains": "gains.yaml"})
     weights = {"digest": own_weights or digest_of(files), "revision": None}
     program = code_of_class("prog_pilot:Pilot") | files

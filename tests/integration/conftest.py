@@ -82,7 +82,7 @@ def ray_home() -> Iterator[Path]:
 
 
 def deploy(config: Deployment) -> None:
-    """Deploy the file with Serve, like `serve deploy` does with a changed file."""
+    """Deploy the file with Serve, as `serve deploy` does with a changed file."""
     from ray.serve.context import _get_global_client
 
     client = _get_global_client()

@@ -25,7 +25,7 @@ HELD: dict[TransportName, int] = {"handle": 2, "shm": 2, "http": 2, "websocket":
 
 
 def deployed(replicas: int) -> Deployment:
-    """Return the deployment, like `serve deploy` would see it with another `num_replicas`."""
+    """Return the deployment, as `serve deploy` would see it with another `num_replicas`."""
     reacher = deployment("served_agents:Reacher").model_dump(exclude_unset=True)
     reacher["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
     return Deployment(applications=reacher["applications"])

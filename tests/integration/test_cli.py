@@ -1,4 +1,4 @@
-"""`vlagents-ray eval` like users run it: serve, roll out, record, stop and continue."""
+"""`vlagents-ray eval` as users run it: serve, roll out, record, stop and continue."""
 
 from __future__ import annotations
 

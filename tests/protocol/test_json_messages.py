@@ -1,4 +1,4 @@
-"""JSON messages, with separate images like curl sends them, and with values in the form of
+"""JSON messages, with separate images as curl sends them, and with values in the form of
 recordings.
 """
 

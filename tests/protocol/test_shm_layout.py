@@ -274,7 +274,7 @@ class WritersAndReaders(RuleBasedStateMachine):
     """One connection with four layouts at most, whose messages may be lost or rejected on either
     side.
 
-    Like in `ShmTransport`, a client begins its layouts again if its message was not sent, or was
+    As in `ShmTransport`, a client begins its layouts again if its message was not sent, or was
     rejected before it was read. The server remembers the layouts that it has read.
     """
 

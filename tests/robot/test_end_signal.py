@@ -69,7 +69,7 @@ class Arm:
 def test_a_signal_ends_a_loop_of_a_users_own_program_and_stops_the_robot(
     number: signal.Signals, *, is_player: bool
 ) -> None:
-    """It ended the process at once, with the arm in motion."""
+    """The robot is stopped before the process ends; it must not stay in motion."""
     arm, agent = Arm(number), Still()
     before = signal.signal(number, signal.SIG_DFL)
     try:

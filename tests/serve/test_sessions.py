@@ -84,7 +84,7 @@ class Heavy(Agent):
 
     def initialize(self) -> None:
         self.model = torch.nn.Sequential(torch.nn.Linear(3, 3), torch.nn.BatchNorm1d(3))
-        self.model.actions = []  # like LeRobot's policies store their queue
+        self.model.actions = []  # as LeRobot's policies store their queue
         self.table = {"big": np.zeros(10)}
         self.own = {"small": np.zeros(10)}
 

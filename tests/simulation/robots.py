@@ -422,7 +422,7 @@ def most_of(costs: CostCurve, needs: Sequence[RobotNeed]) -> int:
 
 def print_fleets() -> None:
     """Print the largest fleets in time and the age of actions at half load."""
-    print("costs  fleet              arithmetic  today  slack  ratio  age p95 at half: today slack")
+    print("costs  fleet              arithmetic  plain  slack  ratio  age p95 at half: plain slack")
     fleets = {
         "50 rows": [(50, 10.0)],
         "8 rows": [(8, 10.0)],

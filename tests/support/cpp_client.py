@@ -43,8 +43,8 @@ def _includes() -> list[str]:
 
 
 def build(folder: Path) -> Path:
-    """Install the client in `folder`, and build its test programs like a user's project would;
-    return the folder of the programs.
+    """Install the client in `folder`, and build its test programs as a user's project would; return
+    the folder of the programs.
     """
     installed, programs = folder / "installed", folder / "programs"
     prefixes = os.pathsep.join(

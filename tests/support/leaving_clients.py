@@ -248,7 +248,7 @@ class StoppableServer:
         return closing and (self.requests > 0 or self.engine.queue._closed)
 
     def stop(self) -> None:
-        """Stop the replica like Serve and `PolicyReplica` do: requests in progress end first, then
+        """Stop the replica as Serve and `PolicyReplica` do: requests in progress end first, then
         the engine and its endpoints.
         """
         if self._stopped:

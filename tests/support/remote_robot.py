@@ -138,7 +138,7 @@ class RemoteRobot:
         return self.query(f"{self.instance_key}/open", request)
 
     def begin(self, **changes: Any) -> RemoteRobot:
-        """Open a session and reset it, like LeRobot's client does."""
+        """Open a session and reset it, as LeRobot's client does."""
         self.accepted = self.open(**changes)
         assert self.accepted.message_type == "accepted", self.accepted
         self.session_id = self.accepted.session_id

@@ -143,7 +143,7 @@ def test_a_server_that_is_waited_for_is_reported_once_within_seconds(
 def test_a_server_that_refuses_connections_is_one_without_replicas(
     kind: type[HttpTransport | WebSocketTransport],
 ) -> None:
-    """So a reset waits for HAProxy like for a replica; both restart within seconds."""
+    """So a reset waits for HAProxy as for a replica; both restart within seconds."""
     transport = kind(f"http://127.0.0.1:{free_port()}", CodecChoice("raw"))
     with pytest.raises(NoReplica, match="is it running"):
         transport.call([Request("reset", Obs(), request_id="1")], 1.0)

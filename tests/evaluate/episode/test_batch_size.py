@@ -238,7 +238,9 @@ def test_a_simulation_that_diverges_again_under_the_same_actions_is_a_failure_of
         ("policy_error", 3, False)
     }
     assert all("diverged, and again under the same actions" in str(one.error) for one in failed)
-    assert len(summary.results.cases[0].attempts) == 3, "the first attempts at both"
+    assert len(summary.results.cases[0].attempts) == 3, (
+        "the first attempts of all episodes are kept"
+    )
 
 
 def test_a_simulation_that_diverges_under_other_actions_is_lost_and_bounds_stand_beside_the_rate(

@@ -253,7 +253,7 @@ def test_of_very_many_checkpoints_only_the_pairs_that_are_asked_for_most_are_com
     monkeypatch.setattr(success, "MOST_COMPARED", 20)
     results = record(runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6), better_later)
     words = page_of(results).section("Comparison")
-    assert "45 pairs of so many checkpoints are left out" in words  # of 55 pairs
+    assert "45 pairs of so many checkpoints are left out" in words  # there are 55 pairs
     assert "further pairs" not in words
     for step in range(200, 2000, 200):
         assert f"learner@{step + 200} learner@{step}" in words

@@ -96,4 +96,4 @@ def test_a_scene_is_set_played_and_judged(
     said = [one for one in page.said if "400" not in one]
     # The page may request one more image while the evaluation ends, and with it the page's server.
     said = [one for one in said if not ("/now/camera/" in one and "ERR_CONNECTION_REFUSED" in one)]
-    assert said == [], "except for the rejected answers"
+    assert said == [], "the page must report no errors other than the rejected answers"

@@ -143,7 +143,7 @@ def test_jax_allocates_as_it_needs_unless_told_otherwise(
     class Jax(FakeJax):
         def devices(self, kind: str = "cpu") -> list[Any]:
             assert os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] == (chosen or "false"), (
-                "before its first use"
+                "JAX must be configured before its first use"
             )
             return super().devices(kind)
 

@@ -361,7 +361,7 @@ def test_an_application_that_misses_its_cancellation_receives_nothing_more(
         await send({"type": "websocket.accept"})
         try:
             while True:
-                with contextlib.suppress(asyncio.CancelledError):  # like `wait_for` does
+                with contextlib.suppress(asyncio.CancelledError):  # as `wait_for` does
                     received.append((await receive())["type"])
                 if len(received) > 3:
                     return

@@ -138,7 +138,9 @@ def act_with_report() -> Request:
 def test_the_ticks_of_a_request_behind_a_hung_call_count_once_with_the_answer_that_it_gets_later(
     engine: Engine, agent: Hanging, clock: Clock
 ) -> None:
-    """They counted at its arrival, and again when it was sent again, as its error asks."""
+    """The error of the request asks its client to repeat it, so its ticks count only with the later
+    answer.
+    """
     engine.stats.enable()
     ask(engine, "bad", "reset", hangs_at="act")
     ask(engine, "good", "reset")
@@ -149,7 +151,7 @@ def test_the_ticks_of_a_request_behind_a_hung_call_count_once_with_the_answer_th
     engine.notice_hung()
     assert isinstance(hung.get(timeout=10).error, OutcomeUnknown)
     assert isinstance(behind.get(timeout=10).error, PolicyUnavailable)
-    # Those of the hung call, which is not sent again.
+    # The ticks of the hung call, which is not repeated.
     assert engine.stats.collect().ticks == {"robot": 5}
 
     agent.over.set()

@@ -95,7 +95,7 @@ def obeys(engine: Engine, name: str = "robot-1") -> tuple[str, int]:
 
 
 def serve(replicas: Replicas, number: int, method: str, *args: Any) -> Any:
-    """Call a method of a replica like another replica does."""
+    """Call a method of a replica as another replica does."""
     work = getattr(HeldSessions, method)(replicas.migrators[number].sessions, *args)
     return asyncio.run_coroutine_threadsafe(work, replicas._loop).result(20)
 
