@@ -248,8 +248,8 @@ def compared(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Resul
 
 
 def reported(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
-    """Compare like `compared`, through the page and the JSON of `report`. Both name the pairs that
-    are not compared.
+    """Compare as `compared` does, but through the page and the JSON of `report`, both of which name
+    the pairs that are not compared.
     """
     played(tmp_path / "a", **STATED)
     again: dict[str, Any] = change() or {}

@@ -1,4 +1,6 @@
-"""Policies that cannot be served fail with the reason."""
+"""Starting a server whose policy or gateway cannot be served fails with an error that states the
+reason.
+"""
 
 from __future__ import annotations
 
