@@ -225,13 +225,20 @@ for needed in (lambda: Recorder({str(tmp_path)!r}, 50), lambda: require("ray")):
     ]
 
 
-@pytest.mark.parametrize("words", [["--help"], ["serve", "noop"]], ids=" ".join)
-def test_a_robots_command_says_in_two_lines_what_to_install_for_it(
-    robot: Path, words: list[str]
+def test_the_help_on_a_robots_computer_names_what_is_there_and_what_to_install(
+    robot: Path,
 ) -> None:
-    command = [robot.parent / "vlagents-ray", *words]
+    command = [robot.parent / "vlagents-ray", "--help"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\n  robot  Drive a robot" in done.stdout
+    assert "pip install 'vlagents-ray[serve]'" in " ".join(done.stdout.split())
+
+
+def test_a_robots_command_says_in_two_lines_what_to_install_for_it(robot: Path) -> None:
+    command = [robot.parent / "vlagents-ray", "serve", "noop"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("vlagents-ray: 'typer' is not installed")
+    assert done.stderr.startswith("Error: 'typer' is not installed")
     assert "pip install 'vlagents-ray[serve]'" in done.stderr
     assert done.stderr.count("\n") == 2

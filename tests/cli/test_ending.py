@@ -57,7 +57,7 @@ typer.run(command)
 def test_it_ends_with_one_sentence(body: str, leave_s: float) -> None:
     ended = run(body, leave_s)
     assert ended.returncode == 1
-    assert ended.stderr.strip() == "error ClusterLost: the raylet has ended; start it again"
+    assert ended.stderr.strip() == "Error: ClusterLost: the raylet has ended; start it again"
 
 
 def test_a_servers_sentence_is_the_last_line_whatever_rays_native_threads_say_of_it() -> None:
@@ -87,7 +87,7 @@ def test_one_that_was_interrupted_says_so_though_the_signal_ended_ray_as_well(
     farewell = "atexit.unregister(time.sleep); atexit.register(time.sleep, 1)"
     body = f"time.sleep({0.5 if noticed else 0}); {farewell}; raise KeyboardInterrupt"
     ended = run(body)
-    assert (ended.returncode, ended.stderr.strip()) == (130, "error interrupted")
+    assert (ended.returncode, ended.stderr.strip()) == (130, "Error: interrupted")
 
 
 def test_a_server_that_hangs_while_it_leaves_ends_and_says_where() -> None:
@@ -112,7 +112,7 @@ def test_an_interrupt_that_python_drops_ends_the_command_all_the_same(number: in
     ended = run(body, lost="60, Lost")
     assert ended.returncode == 130
     assert "Exception ignored in" in ended.stderr, "Python did not drop the exception"
-    assert ended.stderr.endswith("error interrupted\n")
+    assert ended.stderr.endswith("Error: interrupted\n")
 
 
 def test_an_evaluation_does_not_begin_after_an_interrupt_that_was_dropped() -> None:
@@ -158,7 +158,9 @@ def test_ctrl_c_while_modules_are_imported_ends_the_command_without_a_traceback(
         _, said = process.communicate(timeout=60)
     assert process.returncode == 130
     printed = [line for line in said.splitlines() if not line.startswith("import time:")]
-    assert printed == ["error interrupted before the command began; nothing was started or written"]
+    assert printed == [
+        "Error: interrupted before the command began; nothing was started or written"
+    ]
 
 
 def run(

@@ -157,7 +157,7 @@ def evaluate_interrupted(
     assert "Traceback" not in printed
     [error] = [line for line in printed.splitlines() if line.startswith("error ")]
     assert error == (
-        f"error interrupted after {finished} of {EPISODES} episodes; continue with --resume --out out"
+        f"Error: interrupted after {finished} of {EPISODES} episodes; continue with --resume --out out"
     )
     summary = json.loads((folder / "out" / "summary.json").read_text())
     assert (summary["state"], summary["totals"][0]["episodes"]) == ("interrupted", finished)

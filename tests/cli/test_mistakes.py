@@ -4,6 +4,7 @@ that names the cure.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -15,12 +16,14 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from vlagents_ray import InvalidObservation, Obs
+from vlagents_ray.cli.light import OTHERS, ROBOT
 from vlagents_ray.cli.main import app
 from vlagents_ray.protocol.values import require_obs
-from vlagents_ray.registry import pip_install
+from vlagents_ray.registry import names, pip_install
 
 LONGEST_S = 20.0  # CPU time limit for one mistake
 POLICIES = """
@@ -494,7 +497,7 @@ def test_a_full_disk_is_named_and_nothing_is_left(
     status, message = answer(words)
     assert (status, message) == (
         1,
-        "error the disk is full (No space left on device); make room, and repeat the command",
+        "Error: the disk is full (No space left on device); make room, and repeat the command",
     )
     assert sorted(os.listdir(folder)) == before
 
@@ -512,6 +515,58 @@ def test_a_command_that_the_light_install_lacks_is_answered_with_those_that_it_h
     assert done.returncode == 1
     assert f"this is the light install of a robot's computer{guess}" in done.stderr
     assert pip_install("serve") in done.stderr
+    assert done.stderr.startswith("Error: 'typer' is not installed")
+
+
+@pytest.mark.parametrize(("words", "status"), [(["-h"], 0), (["--help"], 0), ([], 2)])
+def test_the_help_of_the_light_install_has_its_commands_and_what_the_others_need(
+    words: list[str], status: int
+) -> None:
+    program = "import sys; sys.modules['typer'] = None; from vlagents_ray.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words],
+        capture_output=True, text=True, check=False, env={**os.environ, "COLUMNS": "100"},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (status, "")
+    words_of_help = " ".join(done.stdout.split())
+    assert "robot Drive a robot or simulation with a policy, an operator, or both." in words_of_help
+    for extra in ("serve", "sim"):
+        assert " ".join(pip_install(extra).split()) in words_of_help
+
+
+def test_the_light_install_names_all_commands_that_it_lacks() -> None:
+    commands = get_command(app).commands  # type: ignore[attr-defined]
+    of_plugins = set(names("commands"))
+    assert {"robot", *itertools.chain(*OTHERS.values())} == set(commands) - of_plugins
+    assert commands["robot"].help.strip() == ROBOT
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["nonsense"],
+        ["serve"],
+        ["serve", "no-such-policy"],
+        ["eval", "tabletop", "--nonsense"],
+        ["eval", "tabletop"],
+        ["robot", "--nonsense"],
+        ["robot", "nonsense"],
+        ["robot", "check"],
+        ["robot", "check", "nonsense:Arm"],
+        ["plan", "--nonsense"],
+        ["slurm", "nonsense"],
+        ["tune", "no-such-policy"],
+    ],
+    ids=" ".join,
+)
+def test_all_errors_of_commands_have_one_form(words: list[str]) -> None:
+    """Of click, of argparse, of this package and of its plug-ins."""
+    done = subprocess.run(
+        [sys.executable, "-m", "vlagents_ray", *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode
+    [line] = [line for line in done.stderr.splitlines() if line.lower().startswith("error")]
+    assert line.startswith("Error: "), line
 
 
 @pytest.mark.parametrize("policy", EPISODES)

@@ -192,7 +192,7 @@ def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:
     assert kept in (2, 3), "would wait for the running loop if it had begun"
     assert (process.returncode, said.decode()) == (
         130,
-        f"error interrupted; {kept} episodes are in {tmp_path}\n",
+        f"Error: interrupted; {kept} episodes are in {tmp_path}\n",
     )
 
 

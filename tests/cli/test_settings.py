@@ -169,7 +169,7 @@ EVAL = ("--out", "runs/x", "--policy")
         ),
         (
             ("eval", "tabletop", "--out", "runs/x"),
-            "error expected --policy, got none; add it, or give a plan",
+            "Error: expected --policy, got none; add it, or give a plan",
         ),
         (("eval", "absent.yaml"), "absent.yaml does not exist"),
         (
@@ -278,7 +278,7 @@ def test_a_url_where_nothing_answers_is_told_once_and_waited_for(
     [warned] = caplog.messages
     assert warned.startswith(f"{url}: not ready; trying again for up to 0 s (")
     assert "is it running?" in warned
-    assert done.stderr.startswith(f"error PolicyUnavailable: {url}: not ready within 0.2 s")
+    assert done.stderr.startswith(f"Error: PolicyUnavailable: {url}: not ready within 0.2 s")
 
 
 def test_without_out_the_results_get_a_new_folder_with_the_time(

@@ -38,7 +38,7 @@ def main() -> None:
         try:
             sys.exit(robot(sys.argv[2:]))
         except KeyboardInterrupt:
-            sys.stderr.write("error interrupted\n")
+            sys.stderr.write("Error: interrupted\n")
             sys.exit(130)
 
     try:
@@ -46,14 +46,19 @@ def main() -> None:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("vlagents_ray"):
             raise
+        if sys.argv[1:] in ([], ["-h"], ["--help"]):
+            from vlagents_ray.cli.light import help_page
+
+            sys.stdout.write(help_page().text())
+            sys.exit(0 if sys.argv[1:] else 2)
         from vlagents_ray.registry import pip_install
 
         guess = did_you_mean(" ".join(sys.argv[1:2]), ["robot"]) or "."
         sys.stderr.write(
-            f"vlagents-ray: {error.name!r} is not installed; this is the light install of a "
+            f"Error: {error.name!r} is not installed; this is the light install of a "
             f"robot's computer{guess}\n"
-            f"It has `vlagents-ray robot`. For the other commands: {pip_install('serve')}; to "
-            f"evaluate: {pip_install('sim')}\n"
+            "It has `vlagents-ray robot`; `vlagents-ray -h` lists all. For the other commands: "
+            f"{pip_install('serve')}; to evaluate: {pip_install('sim')}\n"
         )
         sys.exit(1)
 
@@ -65,7 +70,7 @@ def main() -> None:
 
 def _end_at_once(_number: int, _frame: FrameType | None) -> None:
     """End the process at Ctrl-C while it imports the commands."""
-    os.write(2, b"error interrupted before the command began; nothing was started or written\n")
+    os.write(2, b"Error: interrupted before the command began; nothing was started or written\n")
     os._exit(130)
 
 

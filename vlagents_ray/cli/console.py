@@ -134,7 +134,7 @@ def fail(message: str, code: int) -> NoReturn:
 def say_error(message: str, console: Console | None = None) -> None:
     """Print an error after all other output."""
     sys.stdout.flush()
-    (console or err).print(Text.assemble(("error", "bold red"), f" {message}"))
+    (console or err).print(Text.assemble(("Error:", "bold red"), f" {message}"))
 
 
 def fresh(folder: Path) -> Path:

@@ -150,6 +150,11 @@ def version_line() -> str:
     return f"vlagents-ray {importlib.metadata.version('vlagents-ray')}"
 
 
+def error_line(message: str) -> str:
+    """Return an error as all commands print it; click has the same form for its own errors."""
+    return f"Error: {message}"
+
+
 def usage_error(usage: str, command: str, message: str) -> str:
     """Return the error message for invalid arguments.
 
@@ -158,7 +163,7 @@ def usage_error(usage: str, command: str, message: str) -> str:
         command: The command, such as "vlagents-ray robot".
         message: The reason.
     """
-    return f"Usage: {usage}\nTry '{command} --help' for help.\n\nError: {message}\n"
+    return f"Usage: {usage}\nTry '{command} --help' for help.\n\n{error_line(message)}\n"
 
 
 def _row_lines(row: HelpRow, term_columns: int, columns: int) -> Iterable[str]:

@@ -29,7 +29,7 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.chunking.timeliness import in_words
 from vlagents_ray.cli.arguments import CommandParser, number, one_of, parse_all
 from vlagents_ray.cli.examples import EXAMPLES
-from vlagents_ray.cli.help_page import HelpPage, HelpPanel, HelpRow
+from vlagents_ray.cli.help_page import HelpPage, HelpPanel, HelpRow, error_line
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract
@@ -103,10 +103,10 @@ def main(arguments: Sequence[str]) -> int:
         with ended_by_signals(*END_SIGNALS, signal.SIGINT) as end_signal:
             report = _run(options, end_signal)
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)  # noqa: T201
+        print(error_line("interrupted"), file=sys.stderr)  # noqa: T201
         return 128 + signal.SIGINT
     except VLAgentsError as error:
-        print(printable(f"{type(error).__name__}: {error}"), file=sys.stderr)  # noqa: T201
+        print(printable(error_line(f"{type(error).__name__}: {error}")), file=sys.stderr)  # noqa: T201
         return 2
     if report.mostly_safe is not None:
         return MOSTLY_SAFE
@@ -118,7 +118,7 @@ def _run_subcommand(name: str, arguments: Sequence[str]) -> int:
     try:
         run: Callable[[Sequence[str]], int] = registered_function("commands", name)
     except VLAgentsError as error:
-        print(printable(f"{type(error).__name__}: {error}"), file=sys.stderr)  # noqa: T201
+        print(printable(error_line(f"{type(error).__name__}: {error}")), file=sys.stderr)  # noqa: T201
         return 2
     with ended_by_signals(*END_SIGNALS, signal.SIGINT):
         return run(arguments)

@@ -20,6 +20,7 @@ from dataclasses import asdict, replace
 from functools import partial
 
 from vlagents_ray.cli.arguments import CommandParser, number, parse_all
+from vlagents_ray.cli.help_page import error_line
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.robot.loop import opened, robot_factory
@@ -47,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
             report = _examine(options, stack)
         report.robot = options.robot
     except VLAgentsError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
+        print(error_line(f"{type(error).__name__}: {error}"), file=sys.stderr)  # noqa: T201
         return 2
 
     if options.json:
