@@ -70,7 +70,7 @@ def test_a_servers_sentence_is_the_last_line_whatever_rays_native_threads_say_of
     ended = run(body)
     assert ended.returncode == 1
     assert re.fullmatch(
-        r"(E native\n)+error ClusterLost: the raylet has ended; start it again\n", ended.stderr
+        r"(E native\n)+Error: ClusterLost: the raylet has ended; start it again\n", ended.stderr
     )
 
 

@@ -155,7 +155,7 @@ def evaluate_interrupted(
     status, printed = interrupted(words, number, folder, on_another_thread=on_another_thread)
     assert status == 130, printed
     assert "Traceback" not in printed
-    [error] = [line for line in printed.splitlines() if line.startswith("error ")]
+    [error] = [line for line in printed.splitlines() if line.startswith("Error: ")]
     assert error == (
         f"Error: interrupted after {finished} of {EPISODES} episodes; continue with --resume --out out"
     )
