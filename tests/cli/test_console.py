@@ -41,7 +41,7 @@ def shown(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> io
 def test_a_line_and_an_error_are_shown_as_they_are(shown: io.StringIO) -> None:
     console.progress(CURE)
     console.say_error(CURE)
-    assert shown.getvalue() == f"{CURE}\nerror {CURE}\n"
+    assert shown.getvalue() == f"{CURE}\nError: {CURE}\n"
 
 
 def test_a_table_cuts_nothing_off(shown: io.StringIO) -> None:

@@ -4,6 +4,6 @@ import sys
 
 if __name__ == "__main__":
     sys.exit(
-        "Error: expected a command, got the package vlagents_ray.robot; run: python -m vlagents_ray "
-        "robot --help"
+        "Error: expected a command, got the package vlagents_ray.robot; run: python -m "
+        "vlagents_ray robot --help"
     )
