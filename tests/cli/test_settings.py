@@ -165,7 +165,7 @@ EVAL = ("--out", "runs/x", "--policy")
         ),
         (
             ("eval", "tabletop", "--policy", "scripted", "--resume"),
-            "error --resume: expected --out with it, the folder of the results to continue",
+            "Error: --resume: expected --out with it, the folder of the results to continue",
         ),
         (
             ("eval", "tabletop", "--out", "runs/x"),
