@@ -30,6 +30,8 @@ from benchmarks import (
 from benchmarks.checkpoints import __main__ as checkpoints
 
 
+# Where a mistake is not noticed, the benchmark starts, and would run for as long as a test may.
+@pytest.mark.timeout(120)
 @pytest.mark.parametrize(
     ("module", "words", "text"),
     [
