@@ -1,9 +1,9 @@
 """The parts of ARRO: detectors, segmenters, selectors and trackers.
 
-Each part is a class that takes an instance of its `Config`, and loads its weights in `load`. All
-sessions of a replica share a part, which keeps none of their state: a tracker's memory of one
-session and camera is a separate object, which can be pickled. A part processes the images of
-several sessions at once, and its result for one image must not depend on the others.
+Each part is a class that is constructed with an instance of its `Config`, and loads its weights in
+`load`. All sessions of a replica share a part. The part stores no state of sessions: a tracker's
+memory of one session and camera is a separate object, which can be pickled. A part processes the
+images of several sessions at once, and its result for one image must not depend on the others.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrain
 from vlagents_ray.policies.base.config import DType
 from vlagents_ray.registry import named_class, require
 
-Images = Sequence[np.ndarray]  # (H, W, 3) uint8 RGB each, of any sizes
+Images = Sequence[np.ndarray]  # images of any sizes, (H, W, 3) uint8 RGB each
 
 PARTS: dict[str, dict[str, str]] = {
     "detector": {
@@ -47,22 +47,22 @@ PARTS: dict[str, dict[str, str]] = {
 class Detection:
     """A detected object."""
 
-    phrase: str  # the requested phrase that it was detected for
+    phrase: str  # requested phrase for which the object was detected
     box: np.ndarray  # (4,) float32, px: left, top, right, bottom
     score: float
-    # (H, W) bool; None from a detector without masks, whose boxes are segmented.
+    # The mask, (H, W) bool; None from a detector without masks, whose boxes are segmented.
     mask: np.ndarray | None = None
 
 
 class Part(Protocol):
-    """A part, which is made with an instance of its `Config`."""
+    """A part, which is constructed with an instance of its `Config`."""
 
     def load(self) -> None:
         """Read the weights; raises `ConfigError` if some are missing."""
 
 
 class Detector(Part, Protocol):
-    """Detects objects by phrases."""
+    """Detects objects that phrases describe."""
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
         """Detect objects on each image.
@@ -94,7 +94,7 @@ class Segmenter(Part, Protocol):
         ...
 
     def propose(self, images: Images) -> list[np.ndarray]:
-        """Return regions of each image that may be objects, (M, H, W) bool; some may overlap."""
+        """Return regions of each image that may be objects, (M, H, W) bool. Regions may overlap."""
         ...
 
 
@@ -125,7 +125,7 @@ class Tracker(Part, Protocol):
             masks: The segments of each image, (N, H, W) bool with N >= 1.
 
         Returns:
-            A memory for each image, from which `follow` tracks its segments.
+            A memory for each image, with which `follow` tracks the image's segments.
         """
         ...
 
@@ -139,7 +139,7 @@ class Tracker(Part, Protocol):
             memories: The memories of `begin`, which are updated.
 
         Returns:
-            For each image its segments, (N, H, W) bool, and which of them are visible, (N,) bool.
+            The segments of each image, (N, H, W) bool, and which segments are visible, (N,) bool.
             The mask of a segment that is not visible is undefined.
         """
         ...
@@ -226,12 +226,14 @@ class Untrained:
 
 
 def writable(images: Images) -> list[np.ndarray]:
-    """Return copies of the images: those of a server are read-only, which torch warns about."""
+    """Return copies of the images, since torch warns about read-only images, such as those of a
+    server.
+    """
     return [image.copy() for image in images]
 
 
 def label_linked(right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Label pixels so that two share a label if a chain of linked neighbours connects them.
+    """Label pixels. Two pixels have the same label if a chain of linked neighbours connects them.
 
     Args:
         right: (H, W - 1) bool, whether a pixel is linked to the next one in its row.
@@ -246,8 +248,8 @@ def label_linked(right: np.ndarray, down: np.ndarray) -> np.ndarray:
     first = np.concatenate([index[:, :-1][right], index[:-1][down]])
     second = np.concatenate([index[:, 1:][right], index[1:][down]])
 
-    # Each label is the index of a pixel with the same label or a smaller one, so that the labels
-    # form trees. Each round joins the trees of linked pixels, and then flattens all trees.
+    # Each label is the index of a pixel with the same or a smaller label, so that the labels form
+    # trees. Each round joins the trees of linked pixels, and then flattens all trees.
     labels = index.ravel()
     while True:
         first_labels, second_labels = labels[first], labels[second]
@@ -268,7 +270,7 @@ def connected_regions(mask: np.ndarray, smallest: int = 1) -> list[np.ndarray]:
 
     Args:
         mask: (H, W) bool.
-        smallest: The least number of pixels of a region.
+        smallest: The smallest number of pixels of a region.
 
     Returns:
         The regions, (H, W) bool each, the largest first.
@@ -278,7 +280,7 @@ def connected_regions(mask: np.ndarray, smallest: int = 1) -> list[np.ndarray]:
 
 
 def label_flat(image: np.ndarray, tolerance: int) -> np.ndarray:
-    """Label pixels so that similar neighbours share a label.
+    """Label pixels. Similar neighbours have the same label.
 
     Args:
         image: (H, W, 3) uint8.
@@ -316,7 +318,7 @@ def overlap(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
-    """Return a mask (H, W) bool that is wider by `pixels` to each side."""
+    """Return a mask (H, W) bool whose true area is `pixels` wider on each side."""
     for axis in (0, 1):
         padding = [(0, 0), (0, 0)]
         padding[axis] = (pixels, pixels)
@@ -339,7 +341,7 @@ _HUES = {
 
 
 class ColourConfig(BaseModel, extra="forbid"):
-    """The hue of each word, and which pixels count as coloured."""
+    """The hue of each word, and the criteria of coloured pixels."""
 
     hues: dict[str, float] = Field(default=_HUES, description="word -> hue in degrees")
     tolerance: float = Field(
@@ -357,14 +359,14 @@ class ColourConfig(BaseModel, extra="forbid"):
 
 
 class ColourDetector(Untrained):
-    """Detects each connected region of the colours in a phrase: all red regions for "lift the red
-    puck".
+    """Detects all connected regions in the colours of a phrase, such as all red regions for "lift
+    the red puck".
     """
 
     Config: ClassVar[type] = ColourConfig
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
-        """Return the coloured regions of each image with their masks, the largest first."""
+        """Return the coloured regions of each image with their masks, the largest region first."""
         return [
             self._detections(image, image_phrases)
             for image, image_phrases in zip(images, phrases, strict=True)
@@ -372,7 +374,8 @@ class ColourDetector(Untrained):
 
     def _detections(self, image: np.ndarray, phrases: Sequence[str]) -> list[Detection]:
         config = self._config
-        hsv = np.asarray(Image.fromarray(image).convert("HSV"), np.float32)  # 0 to 255
+        # Value of the pixels, 0 to 255.
+        hsv = np.asarray(Image.fromarray(image).convert("HSV"), np.float32)
         hue, saturation, value = np.moveaxis(hsv, -1, 0)
         is_coloured = (saturation >= config.saturation * 255) & (value >= config.value * 255)
         smallest = max(1, round(config.smallest * hue.size))
@@ -415,7 +418,9 @@ class FlatSegmenter(Untrained):
     Config: ClassVar[type] = FlatConfig
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the regions that lie wholly in each box, as one mask for the box."""
+        """Return the union of all regions that lie completely in each box, as one mask for each
+        box.
+        """
         return [
             self._inside(image, image_boxes)
             for image, image_boxes in zip(images, boxes, strict=True)
@@ -456,14 +461,15 @@ class CircleConfig(BaseModel, extra="forbid"):
 
 
 class CircleSelector(Untrained):
-    """Selects regions that lie wholly in a circle: for a fixed camera, and a robot that begins
-    each episode in its home position.
+    """Selects the regions that lie completely in a circle.
+
+    This is for a fixed camera, and a robot that begins each episode in its home position.
     """
 
     Config: ClassVar[type] = CircleConfig
 
     def select(self, images: Images, regions: Sequence[np.ndarray]) -> list[list[int]]:
-        """Return the indices of the regions of each image that lie wholly in the circle."""
+        """Return the indices of the regions of each image that lie completely in the circle."""
         selected = []
         for image, masks in zip(images, regions, strict=True):
             outside = self._outside(*image.shape[:2])
@@ -483,7 +489,7 @@ class CircleSelector(Untrained):
         return np.asarray(distance > self._config.radius * min(height, width))
 
 
-_SHADES = 16  # levels of each channel
+_SHADES = 16  # number of levels of each channel
 
 
 class IouConfig(BaseModel, extra="forbid"):
@@ -510,14 +516,15 @@ class IouConfig(BaseModel, extra="forbid"):
 
 @dataclass(slots=True)
 class _Segment:
-    # (4096,) bool: colours with a greater share in the segment than in the rest of the first frame.
+    # The typical colours of the segment, (4096,) bool: colours with a larger share in the segment
+    # than in the other pixels of the first frame.
     colours: np.ndarray
-    pixels: int  # on the first frame
-    mask: np.ndarray  # (H, W) bool, its last visible position
+    pixels: int  # number of pixels on the first frame
+    mask: np.ndarray  # mask at the last visible position, (H, W) bool
 
 
 class IouTracker(Untrained):
-    """Tracks the connected region in a segment's colours that best overlaps the segment's last
+    """Tracks a segment as the connected region in the segment's colours that best overlaps its last
     position.
     """
 
@@ -566,8 +573,8 @@ class IouTracker(Untrained):
         if not regions:
             return False
 
-        # If no region overlaps, the nearest one is chosen: a small object may move by more than
-        # its own size.
+        # If no region overlaps, the nearest region is chosen, since a small object may move by more
+        # than its own size.
         best = max(regions, key=lambda region: (overlap(region, last), -_distance(region, last)))
         segment.mask = np.zeros_like(segment.mask)
         segment.mask[window] = best
@@ -580,13 +587,15 @@ def _distance(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _shades(image: np.ndarray) -> np.ndarray:
-    """Return (H, W) int: the index of each pixel's colour among 4096."""
+    """Return the index of each pixel's colour among 4096 colours, (H, W) int."""
     red, green, blue = np.moveaxis(image.astype(np.int32) * _SHADES // 256, -1, 0)
     return np.asarray((red * _SHADES + green) * _SHADES + blue)
 
 
 def _typical_colours(shades: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return which colours have a greater share inside of a mask than outside, (4096,) bool."""
+    """Return which colours have a larger share inside of a mask than outside of it, (4096,)
+    bool.
+    """
     inside = np.bincount(shades[mask], minlength=_SHADES**3)
     outside = np.bincount(shades[~mask], minlength=_SHADES**3)
     return np.asarray(inside * outside.sum() > outside * inside.sum())

@@ -1,4 +1,4 @@
-"""Pretrained parts of ARRO: Grounding DINO finds objects by words, and SAM 2 segments and tracks
+"""Pretrained parts of ARRO: Grounding DINO finds objects from words, and SAM 2 segments and tracks
 them.
 """
 
@@ -23,7 +23,7 @@ from vlagents_ray_arro.parts import (
 
 
 class GroundingDinoConfig(PretrainedConfig):
-    """The weights, and which boxes count."""
+    """The weights, and the criteria for boxes."""
 
     checkpoint: str = Field(default="IDEA-Research/grounding-dino-tiny", min_length=1)
     threshold: float = Field(
@@ -33,7 +33,7 @@ class GroundingDinoConfig(PretrainedConfig):
         default=0.7,
         ge=0,
         le=1,
-        description="intersection over union from which two boxes are of one object",
+        description="intersection over union above which two boxes belong to the same object",
     )
     most: int = Field(
         default=4, ge=1, description="largest number of boxes of a phrase, the best ones first"
@@ -41,17 +41,18 @@ class GroundingDinoConfig(PretrainedConfig):
 
 
 class GroundingDinoDetector(Pretrained):
-    """Detects boxes for phrases, or for the objects in an instruction, in one pass for each size
-    of image.
+    """Detects boxes for phrases, or for the objects in an instruction, in one pass for each image
+    size.
     """
 
     Config: ClassVar[type] = GroundingDinoConfig
     classes = ("GroundingDinoForObjectDetection", "GroundingDinoProcessor")
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
-        """Return boxes, the best first. A box belongs to the phrase of its best word."""
+        """Return boxes, the best box first. A box belongs to the phrase of its best word."""
         detections: list[list[Detection]] = [[] for _ in images]
-        # Images of one size at a time: the padding of a mixed batch would change the result.
+        # Images of each size are processed separately, since the padding of a mixed batch would
+        # change the result.
         for shape in {image.shape for image in images}:
             indices = [i for i, image in enumerate(images) if image.shape == shape]
             computed = self._detect_one_size(
@@ -73,7 +74,7 @@ class GroundingDinoDetector(Pretrained):
         with torch.inference_mode():
             outputs = self._model(**inputs.to(self._model.device, self._model.dtype))
         token_scores = outputs.logits.float().sigmoid().cpu().numpy()  # (B, queries, tokens)
-        # (B, queries, 4): centre and size, as shares of the image.
+        # Centre and size as shares of the image, (B, queries, 4).
         boxes = outputs.pred_boxes.float().cpu().numpy()
 
         detections = []
@@ -89,7 +90,7 @@ class GroundingDinoDetector(Pretrained):
         tokenizer = self._processor.tokenizer
         offsets = tokenizer(_text(phrases), return_offsets_mapping=True)["offset_mapping"]
         scores = []
-        start = 0  # the character of the text at which the phrase begins
+        start = 0  # index of the character at which the phrase begins
         for phrase in map(_clean, phrases):
             end = start + len(phrase)
             tokens = [i for i, (left, right) in enumerate(offsets) if start <= left < right <= end]
@@ -104,7 +105,7 @@ class GroundingDinoDetector(Pretrained):
 
         Args:
             image: The image.
-            phrases: Its phrases.
+            phrases: The phrases of the image.
             scores: The score of each query for each phrase, (queries, phrases).
             boxes: The box of each query, (queries, 4): centre and size, as shares of the image.
         """
@@ -130,7 +131,7 @@ class GroundingDinoDetector(Pretrained):
         return detections
 
 
-_BETWEEN = ". "  # between the phrases of a text
+_BETWEEN = ". "  # separator between the phrases of a text
 
 
 def _clean(phrase: str) -> str:
@@ -138,7 +139,7 @@ def _clean(phrase: str) -> str:
 
 
 def _text(phrases: Sequence[str]) -> str:
-    """Join phrases in the form of Grounding DINO's training."""
+    """Join phrases in the same form as in Grounding DINO's training."""
     return _BETWEEN.join(map(_clean, phrases)) + "."
 
 
@@ -158,8 +159,8 @@ class Sam2Config(PretrainedConfig):
 
 
 class Sam2SegmenterConfig(Sam2Config):
-    """The proposal of regions: a mask for each point of a grid, without uncertain and repeated
-    ones.
+    """The settings of proposed regions: a mask for each point of a grid, without uncertain and
+    repeated masks.
     """
 
     points: int = Field(default=16, ge=1, description="points of the grid along each side")
@@ -173,7 +174,7 @@ class Sam2SegmenterConfig(Sam2Config):
         default=0.7,
         ge=0,
         le=1,
-        description="intersection over union from which two masks are of one region",
+        description="intersection over union above which two masks belong to the same region",
     )
 
 
@@ -216,8 +217,10 @@ class Sam2Segmenter(Pretrained):
         return proposed
 
     def _best_different(self, scores: np.ndarray, masks: np.ndarray) -> list[int]:
-        """Return the indices of masks (M, h, w) bool with high scores (M,), without those that
-        repeat a better one; the best first.
+        """Return the indices of masks, (M, h, w) bool, in the order of their scores, (M,), the best
+        mask first.
+
+        Masks that repeat a better mask are excluded.
         """
         indices: list[int] = []
         for i in np.argsort(-scores, kind="stable"):
@@ -256,8 +259,8 @@ class Sam2Segmenter(Pretrained):
 class _TrackMemory:
     """SAM 2's memory of one camera of one session."""
 
-    # transformers' session, with only those features and object pointers of the last frames that
-    # the model still reads.
+    # The session of transformers, with only the features and object pointers of the last frames
+    # that the model still reads.
     session: Any
     frame: int = 0  # number of the next frame
 
@@ -265,7 +268,7 @@ class _TrackMemory:
 class Sam2Tracker(Pretrained):
     """The video model with a memory for each session and camera.
 
-    The image encoder, which takes most of the time, runs once for all images; memory attention runs
+    The image encoder, which takes most of the time, runs once for all images. Memory attention runs
     once for each object.
     """
 
@@ -292,8 +295,9 @@ class Sam2Tracker(Pretrained):
     def follow(
         self, images: Images, memories: Sequence[Any]
     ) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the masks on the next frame. A segment that the model predicts to be hidden is
-        not visible.
+        """Return the masks on the next frame.
+
+        If the model predicts that a segment is hidden, the segment is not visible.
         """
         followed = []
         for image, outputs in zip(images, self._advance(images, memories), strict=True):
@@ -321,8 +325,9 @@ class Sam2Tracker(Pretrained):
         return outputs
 
     def _forget(self, memory: _TrackMemory) -> None:
-        """Delete from a memory everything that the next frame does not need; transformers' session
-        would keep all frames with their masks.
+        """Delete everything that the next frame does not need from a memory.
+
+        The session of transformers would keep all frames with their masks.
         """
         session = memory.session
         session.cache.clear_all()

@@ -1,4 +1,4 @@
-"""What this distribution registers."""
+"""The registry entries of this distribution."""
 
 from vlagents_ray.registry import RegistryEntry
 

@@ -1,4 +1,4 @@
-"""The wrapper that shows the policy segments on a virtual background, and the tracks of these
+"""The wrapper that shows segments on a virtual background to the policy, and the tracks of these
 segments.
 """
 
@@ -39,11 +39,14 @@ from vlagents_ray_arro.parts import (
 )
 
 Channel = int
-Colour = tuple[Channel, Channel, Channel]  # RGB, 0 to 255
+Colour = tuple[Channel, Channel, Channel]  # RGB values, 0 to 255
 
 
 class BackgroundConfig(BaseModel, extra="forbid"):
-    """A colour, optionally with a grid on it, or an image; as in the policy's training."""
+    """The background: a colour, optionally with a grid, or an image.
+
+    It must be the same as in the policy's training.
+    """
 
     colour: Colour = (0, 0, 0)
     grid: Colour | None = Field(
@@ -56,7 +59,7 @@ class BackgroundConfig(BaseModel, extra="forbid"):
         description="distance of the grid's lines, in shorter sides of the image",
     )
     image: Path | None = Field(
-        default=None, description="a file that is stretched to each camera's size"
+        default=None, description="an image file, which is stretched to the size of each camera"
     )
 
     @model_validator(mode="after")
@@ -162,20 +165,21 @@ class ArroConfig(BaseModel, extra="forbid"):
     )
     missing: Literal["refuse", "hide"] = Field(
         default="refuse",
-        description="if an object is missing on the first frame: refuse the episode, or begin it "
-        "without the object and search for it again as if it were lost",
+        description="if an object is missing on the first frame: reject the episode, or begin it "
+        "without the object and search for the object again as if it were lost",
     )
     keep_lost: int = Field(
         default=5,
         ge=0,
-        description="frames for which a lost segment is shown at its last position; after these, "
-        "and each time that as many have passed, it is searched for as on the first frame",
+        description="number of frames for which a lost segment is shown at its last position; on "
+        "the frame after them, the segment is searched for as on the first frame, and this search "
+        "is repeated at the same interval",
     )
 
 
-GRIPPER = "(gripper)"  # the label of the selector's regions; never a phrase for the detector
-Segment = tuple[str, np.ndarray]  # label and mask, (H, W) bool
-# Intersection over union from which a detected object is one that is already tracked.
+GRIPPER = "(gripper)"  # label of the selector's regions; never a phrase for the detector
+Segment = tuple[str, np.ndarray]  # a segment: its label and its mask, (H, W) bool
+# The intersection over union above which a detected object is regarded as already tracked.
 _SAME = 0.5
 
 
@@ -187,10 +191,11 @@ class Track:
     labels: list[str] = field(default_factory=list)  # the label of each segment
     # The mask of each segment at its last visible position, (H, W) bool.
     masks: list[np.ndarray] = field(default_factory=list)
-    lost_frames: list[int] = field(default_factory=list)  # for each segment; 0: it is visible
+    # Number of frames since each segment was visible; 0 means visible.
+    lost_frames: list[int] = field(default_factory=list)
     memory: Any = None  # the tracker's memory
     incomplete_frames: int = 0  # consecutive frames on which a segment has been missing
-    searched: bool = True  # whether this frame was searched
+    searched: bool = True  # whether objects were searched for on this frame
 
     @property
     def visible(self) -> list[Segment]:
@@ -221,8 +226,8 @@ class Track:
 
         Args:
             shape: The height and the width of the image.
-            keep_lost: For how many frames a lost segment remains at its last position.
-            grow: By how many pixels the union is widened on each side.
+            keep_lost: The number of frames for which a lost segment remains at its last position.
+            grow: The number of pixels by which the union is widened on each side.
 
         Returns:
             The union, (H, W) bool.
@@ -238,7 +243,7 @@ class Track:
 
         Args:
             masks: The mask of each segment, (H, W) bool.
-            visible: Which segments are visible, (N,) bool; the others keep their masks.
+            visible: Which segments are visible, (N,) bool. Other segments keep their masks.
         """
         new_masks, lost_frames = [], []
         for mask, last_mask, lost, is_visible in zip(
@@ -256,8 +261,8 @@ class Track:
 
 
 class Tracking:
-    """Detector, segmenter, selector and tracker together, for any number of sessions and cameras
-    at once.
+    """The combination of detector, segmenter, selector and tracker, for any number of sessions and
+    cameras.
     """
 
     def __init__(self, config: ArroConfig) -> None:
@@ -283,7 +288,7 @@ class Tracking:
             phrases: The phrases of the objects.
 
         Returns:
-            A track for each image; its `missing` lists the objects that were not found.
+            A track for each image. The track's `missing` lists the objects that were not found.
         """
         required = tuple(phrases) if self._selector is None else (*phrases, GRIPPER)
         tracks = [Track(required) for _ in images]
@@ -310,8 +315,10 @@ class Tracking:
             self._search([images[i] for i in due], [tracks[i] for i in due])
 
     def _search(self, images: Images, tracks: Sequence[Track]) -> None:
-        """Search for missing objects. A track for which some are found begins again with these and
-        its visible segments.
+        """Search for missing objects.
+
+        If objects of a track are found, the track begins again with these objects and its visible
+        segments.
         """
         phrases = []
         for track in tracks:
@@ -340,7 +347,7 @@ class Tracking:
     def _find_objects(
         self, images: Images, phrases: Sequence[Sequence[str]]
     ) -> list[list[Segment]]:
-        """Return the objects of the phrases on each image, without those whose mask is empty."""
+        """Return the objects of the phrases on each image, without objects with an empty mask."""
         detections: list[list[Detection]] = [[] for _ in images]
         requested = [i for i, image_phrases in enumerate(phrases) if image_phrases]
         if requested:
@@ -365,7 +372,7 @@ class Tracking:
         """Return the detections on each image with their masks, which the segmenter computes if
         the detector does not.
         """
-        boxes: dict[int, list[np.ndarray]] = {}  # by the index of the image
+        boxes: dict[int, list[np.ndarray]] = {}  # detections by the index of the image
         for i, image_detections in enumerate(detections):
             for detection in image_detections:
                 if detection.mask is None:
@@ -403,8 +410,8 @@ class Tracking:
         return grippers
 
 
-# Key of `Act.info` and of the result of `reset`, with {camera: {"seen": labels, "missing": labels,
-# "searched": bool}}.
+# The key in `Act.info` and in the result of `reset`. Its value is {camera: {"seen": labels,
+# "missing": labels, "searched": bool}}.
 INFO = "arro"
 
 
@@ -412,9 +419,9 @@ class Arro(Wrapper):
     """Paints over everything except the gripper and the objects of the task, on the cameras of the
     config.
 
-    Each session tracks its own objects; detector, segmenter and tracker process the images of all
-    sessions of a batch together. `Obs.info` is not changed, so an image in it, such as a goal, must
-    already show the virtual background.
+    Each session tracks its own objects. Detector, segmenter and tracker process the images of all
+    sessions of a batch together. `Obs.info` is not changed, so an image in `Obs.info`, such as a
+    goal, must already show the virtual background.
     """
 
     Config: ClassVar[type] = ArroConfig
@@ -449,7 +456,7 @@ class Arro(Wrapper):
         """Load the parts and the policy.
 
         Raises:
-            ConfigError: Weights are missing, or a configured camera is none of the policy's.
+            ConfigError: Weights are missing, or a configured camera is not a camera of the policy.
         """
         with used_checkpoints() as part_files:
             self.background.load()
@@ -481,16 +488,18 @@ class Arro(Wrapper):
             kwargs: Arguments for the policy.
 
         Returns:
-            The policy's information, and which objects were found under "arro".
+            The policy's information. The entry "arro" contains which objects were found.
 
         Raises:
-            InvalidObservation: No objects are named, or one of them is not found.
+            InvalidObservation: No objects are named, or an object is not found.
             MissingCamera: A camera is not in the observation.
         """
         return {**super().reset(obs, instruction, **kwargs), INFO: self._report()}
 
     def begin(self, obs: Obs, instruction: str | None) -> Obs:
-        """Search for the objects on the first observation, and return it with the background."""
+        """Search for the objects on the first observation, and return the observation with the
+        background.
+        """
         names = self._camera_names(obs)
         phrases = self.config.objects or ([instruction] if instruction else [])
         if not phrases:
@@ -532,7 +541,9 @@ class Arro(Wrapper):
         return results
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Compute the policy's actions, and report the objects of each session in their info."""
+        """Compute the policy's actions, and report the objects of each session in the info of
+        its action.
+        """
         acts = super().act_batch(obs, sessions)
         for i, (act, session) in enumerate(zip(acts, sessions, strict=True)):
             if not isinstance(act, Exception):
@@ -540,7 +551,9 @@ class Arro(Wrapper):
         return acts
 
     def _camera_names(self, obs: Obs) -> list[str]:
-        """Return the cameras to change; raises `MissingCamera` unless the observation has all."""
+        """Return the cameras to change; raises `MissingCamera` unless the observation has all of
+        them.
+        """
         names = list(self.config.cameras or self._policy_cameras() or obs.cameras)
         for name in names:
             if name not in obs.cameras:
@@ -548,7 +561,7 @@ class Arro(Wrapper):
         return names
 
     def _views(self, obs: Obs) -> list[tuple[np.ndarray, Track]]:
-        """Return the images to change with their tracks, all of which are unchanged.
+        """Return the images to change with their tracks. Both are not changed yet.
 
         Raises:
             MissingCamera: An image is missing.

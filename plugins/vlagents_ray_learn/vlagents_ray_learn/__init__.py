@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from vlagents_ray_learn.training_evaluation import TrainingEvaluation
     from vlagents_ray_learn.vector_env import BatchVectorEnv, as_vector_env
 
-# Module -> its names.
+# Module -> names that it defines.
 _NAMES = {
     "columns": ("LogRatio", "answers", "arrays", "log_ratio"),
     "publisher": ("Publisher",),

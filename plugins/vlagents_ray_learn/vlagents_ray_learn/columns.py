@@ -32,9 +32,9 @@ returns one for the whole chunk, the first row has it, and the other rows have N
 
 With `want=["replay"]` there is a column for each name in `act.info["behaviour"]["replay"]`, such as
 `replay.tokens`, (A, H, D) int64, `replay.chain`, (A, K + 1, H, M) float32, and
-`replay.noise_level`, (A,). Values belong to whole chunks, even if only some rows are executed, and
-have the dtypes of the policy. In Arrow, each value is in the first row of its answer's chunk.
-`answers` returns the number of the answer of each step.
+`replay.noise_level`, (A,). These values belong to whole chunks, even if only some rows are
+executed, and have the dtypes of the policy. In Arrow, each value is in the first row of its
+answer's chunk. `answers` returns the number of the answer of each step.
 """
 
 from __future__ import annotations
@@ -54,17 +54,19 @@ REPLAY = "replay"
 
 
 def arrays(transitions: Any) -> dict[str, np.ndarray]:
-    """Return the columns of transitions as numpy arrays, with the shapes that the module lists.
+    """Return the columns of transitions as numpy arrays, with the shapes that the docstring of the
+    module lists.
 
-    Numbers and images of a record batch, or of a table of one chunk, are read-only views of its
-    memory. Several chunks are first copied into one. Text becomes an array of objects.
+    Numbers and images of a record batch, or of a table with one chunk, are read-only views of
+    Arrow's memory. Several chunks are first copied into one chunk. Text becomes an array of
+    objects.
 
     Args:
         transitions: A `pyarrow.RecordBatch` or a `pyarrow.Table` of rollouts.
 
     Returns:
-        The arrays by the names of the columns. They have one row per step, and those of `final.`
-        columns have one row per episode.
+        The arrays by the names of the columns. An array has one row per step, or one row per
+        episode for a `final.` column.
     """
     pa: Any = optional("pyarrow")
     if isinstance(transitions, pa.Table):
@@ -87,29 +89,32 @@ def answers(columns: Mapping[str, np.ndarray]) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class LogRatio:
-    """The differences between a learner's and the server's log-probabilities of answers."""
+    """The differences between a learner's and the server's log-probabilities of the same
+    answers.
+    """
 
-    mean: float  # nats per answer
-    std: float  # nats per answer
+    mean: float  # mean difference, nats per answer
+    std: float  # standard deviation, nats per answer
     acts: int  # number of answers compared
 
 
 def log_ratio(learner: Any, server: Any) -> LogRatio:
     """Compare the log-probabilities of the same answers between a learner and the server.
 
-    Both must have the same weights. Before the first step of an optimizer, the ratio of a policy
-    gradient should be 1, and the difference of log-probabilities 0. Differences of precision,
-    kernels or preprocessing change it, and grow with the number of values of an answer.
+    Both must have the same weights. Before the first step of an optimizer, the probability ratio of
+    a policy gradient should be 1, and the difference of log-probabilities should be 0. Other
+    precision, kernels or preprocessing cause a difference, which grows with the number of values of
+    an answer.
 
     Args:
         learner: The learner's log-probabilities, (B, ...), nats: an array or a tensor, on any
             device.
         server: `info["behaviour"]["logprob"]` of the same answers, or their `columns["logprob"]`,
-            with the same shape. The first dimension is that of the answers, and the values of each
-            are summed. Answers with NaN are left out.
+            with the same shape. The first dimension is the answers, and the values of each answer
+            are summed. Answers with NaN are excluded.
 
     Returns:
-        Mean and standard deviation of learner - server over the answers.
+        The mean and standard deviation of learner minus server over the answers.
 
     Raises:
         InvalidInput: The shapes differ, or all answers have NaN.
@@ -125,7 +130,7 @@ def log_ratio(learner: Any, server: Any) -> LogRatio:
     ratios = ratios[~np.isnan(ratios)]
     if not ratios.size:
         raise InvalidInput(
-            "log_ratio: expected acts with log-probabilities, got none; request them with "
+            "log_ratio: expected answers with log-probabilities, got none; request them with "
             'want=["logprob"]'
         )
     return LogRatio(float(ratios.mean()), float(ratios.std()), ratios.size)
@@ -144,9 +149,9 @@ def _view(pa: Any, column: Any) -> Any:
 
 
 def tensors(pa: Any, values: np.ndarray) -> Any:
-    """Return (T,) or (T, ...) values as an Arrow array that shares their memory."""
+    """Return (T,) or (T, ...) values as an Arrow array that shares the values' memory."""
     if values.dtype == np.bool_:
-        # The default booleans of Arrow are bits, of which numpy has no view.
+        # Arrow stores booleans as bits by default, and numpy cannot view bits.
         return pa.Bool8Array.from_numpy(values)
     if values.ndim == 1:
         return pa.array(values)
@@ -159,7 +164,7 @@ def at_rows(pa: Any, values: np.ndarray, rows: np.ndarray) -> Any:
     Args:
         pa: The module `pyarrow`.
         values: (N, ...), in the order of their rows.
-        rows: (T,) bool, of which N are true: the rows with a value.
+        rows: Which rows have a value, (T,) bool, of which N are true.
     """
     offsets = np.append(0, np.cumsum(rows)).astype(np.int32)
     return pa.ListArray.from_arrays(pa.array(offsets), tensors(pa, values))

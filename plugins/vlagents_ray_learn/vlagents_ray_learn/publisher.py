@@ -1,4 +1,6 @@
-"""Pushes of a learner's weights to served policies: `Publisher`, and its three kinds of targets."""
+"""The `Publisher`, which pushes a learner's weights to served policies, and its three kinds of
+targets.
+"""
 
 from __future__ import annotations
 
@@ -40,10 +42,11 @@ from vlagents_ray_learn.weights_endpoint import PART, PATH
 logger = logging.getLogger(__name__)
 
 _ANSWER_S = 10.0  # time limit for the request of the versions
-_PART_S = 60.0  # time limit for sending a part, 1 MiB
+_PART_S = 60.0  # time limit for sending a part of 1 MiB
 _PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nodes
 _DISTRIBUTION = "vlagents-ray-learn"
-# Unacknowledged parts, 1 MiB each, over the network. With one, each part would take a round trip.
+# The number of parts, 1 MiB each, that may be unacknowledged on the network. With one, each part
+# would take a round trip.
 _WINDOW = 16
 
 
@@ -55,8 +58,8 @@ class Publisher(AbstractContextManager["Publisher"]):
             version = weights.push(model.state_dict())
             assert weights.acknowledged(version) == 2  # replicas
 
-    Every replica checks and holds a version before any replica acts with it, so that a push
-    succeeds at all replicas or at none.
+    Every replica checks and stores a version before any replica uses it, so that a push succeeds at
+    all replicas or at none.
     """
 
     def __init__(
@@ -103,7 +106,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         pin: bool = False,
         version: int | None = None,
     ) -> int:
-        """Push new weights to the policy, and return their version once all replicas hold them.
+        """Push new weights to the policy, and return their version once all replicas have them.
 
         Args:
             values: The values by the names of `Trainable.parameters`: numpy or JAX arrays or torch
@@ -114,7 +117,7 @@ class Publisher(AbstractContextManager["Publisher"]):
                 they reset with `weights="follow"`.
             partial: Whether names may be missing, as when only adapters are trained. Their values
                 do not change.
-            allow_same: Whether all values may equal those of the policy.
+            allow_same: Whether all values may be equal to the values of the policy.
             pin: Whether robots, and other sessions that do not follow the newest version, also use
                 this version after their next reset.
             version: The number of the version, such as the step of training; by default the number
@@ -125,7 +128,7 @@ class Publisher(AbstractContextManager["Publisher"]):
 
         Raises:
             InvalidWeights: The values do not fit the policy; nothing was changed.
-            UnchangedWeights: The values equal those of the policy.
+            UnchangedWeights: The values are equal to the values of the policy.
             InvalidInput: The version is not above the newest one.
             NotTrainable: The policy names no parameters to train.
             Overloaded: Another push is under way.
@@ -148,8 +151,8 @@ class Publisher(AbstractContextManager["Publisher"]):
         Args:
             offload: Whether to move the weights to the memory of the host, and free CUDA graphs.
                 Otherwise both stay on the GPU, and only unused memory is freed.
-            at_most_s: Time after which the policy wakes by itself, since its learner may have died,
-                s.
+            at_most_s: The time after which the policy wakes by itself, s. The learner may have
+                died.
 
         Raises:
             NotTrainable: The policy names no parameters, which `offload` would move.
@@ -162,13 +165,12 @@ class Publisher(AbstractContextManager["Publisher"]):
     def wake(
         self, values: Mapping[str, Any] | None = None, *, mode: PushMode = "keep", **options: Any
     ) -> int | None:
-        """Let the policy act again after `sleep`, with the same weights or new ones.
+        """Let the policy answer requests again after `sleep`, with the same weights or new ones.
 
         Free the learner's memory on the GPU before this call.
 
         Args:
-            values: New weights, with which the policy acts from now on; None keeps the weights
-                that it had before `sleep`.
+            values: New weights for the policy; None keeps the weights that it had before `sleep`.
             mode: As for `push`.
             options: Further options of `push`.
 
@@ -177,7 +179,7 @@ class Publisher(AbstractContextManager["Publisher"]):
 
         Raises:
             PolicyUnavailable: The GPU has too little memory; the policy is still asleep.
-            VLAgentsError: The errors of `push`; the policy then acts with its former weights.
+            VLAgentsError: The errors of `push`. The policy then uses its former weights.
         """
         self._target.rest(Rest("restore"))
         try:
@@ -186,7 +188,7 @@ class Publisher(AbstractContextManager["Publisher"]):
             self._target.rest(Rest("wake"))
 
     def acknowledged(self, version: int) -> int:
-        """Return the number of replicas that act with a version, or with a later one.
+        """Return the number of replicas that use this version or a later one.
 
         Args:
             version: The result of `push`.
@@ -194,17 +196,18 @@ class Publisher(AbstractContextManager["Publisher"]):
         return sum(newest >= version for newest in self._target.versions())
 
     def close(self) -> None:
-        """Close the connection; the policy keeps its weights."""
+        """Close the connection. The policy keeps its weights."""
 
     def __exit__(self, *exc: object) -> None:
         self.close()
 
 
 class EngineTarget:
-    """An engine in this process; tensors are copied once, on their device.
+    """An engine in this process.
 
-    The three targets have the same methods: `push` returns the version, `rest` lets all replicas
-    sleep, restore their memory or wake, and `versions` returns the newest version of each replica.
+    Tensors are copied once, on their device. The three kinds of targets have the same methods:
+    `push` returns the version, `rest` makes all replicas sleep, restore their memory or wake, and
+    `versions` returns the newest version of each replica.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -226,10 +229,10 @@ class EngineTarget:
 class AppTarget:
     """An application of this process's Ray cluster.
 
-    If the learner and all replicas have their weights on the same GPU, the replicas copy them from
-    the learner's memory. Otherwise the values are put into Ray's object store once. All replicas of
-    this node read them there, without a copy if the policy is on the CPU. Ray transfers them once
-    to each other node.
+    If the learner and all replicas have their weights on the same GPU, the replicas copy the
+    weights from the learner's memory. Otherwise, the values are put into Ray's object store once.
+    All replicas of this node read the values there, without a copy if the policy is on the CPU. Ray
+    transfers the values once to each other node.
     """
 
     def __init__(self, app: str) -> None:
@@ -247,14 +250,16 @@ class AppTarget:
         self._app = app
 
     def push(self, values: Mapping[str, Any], options: PushOptions) -> int:
-        """Push through the GPU's memory if that is possible, otherwise through the object store."""
+        """Push through the GPU's memory if possible, otherwise through the object store."""
         if gpu_of(values):
             try:
                 with shared(values) as shared_values:
                     return self._push(shared_values, options)
             except NotShared as error:
                 logger.info(
-                    "serve://%s: the weights go through Ray's object store: %s", self._app, error
+                    "serve://%s: the weights are sent through Ray's object store: %s",
+                    self._app,
+                    error,
                 )
         import ray
 
@@ -272,7 +277,8 @@ class AppTarget:
     def _call(self, method: str, *args: Any, timeout_s: float) -> Any:
         """Call a method of the `WeightsPart` of any replica.
 
-        The method is named, since the part's module needs Ray, and this module does not.
+        The method is passed as a name, since the part's module imports Ray, which this module does
+        not need.
         """
         import ray
         from ray import serve
@@ -351,7 +357,10 @@ class ServerTarget:
         return int(answer["version"])
 
     def _receive_answer(self, socket: ProxiedSocket) -> dict[str, Any]:
-        """Return the answer to the oldest unacknowledged part; an error is raised."""
+        """Return the answer to the oldest unacknowledged part.
+
+        If the answer is an error, raise it.
+        """
         try:
             answer: dict[str, Any] = json.loads(socket.recv(_PUSH_S))
         except (ConnectionClosed, OSError) as error:
@@ -374,7 +383,9 @@ class ServerTarget:
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """Explain errors of a server without the part, which does not have these paths."""
+        """Raise errors of a server without the part, which lacks these paths, with an
+        explanation.
+        """
         try:
             yield
         except (Forbidden, UnknownApp) as error:
@@ -383,7 +394,7 @@ class ServerTarget:
             raise _has_no_part(self._base) from error
 
     def _may_have_part(self) -> bool:
-        """Return whether the server's metadata names the part, or cannot be read."""
+        """Return whether the server's metadata contains the part, or cannot be read."""
         try:
             with self._http() as http:
                 return PART in http.get("/v1/metadata", _ANSWER_S)["parts"]
@@ -392,7 +403,7 @@ class ServerTarget:
 
 
 def _portable(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values by name, whose arrays and tensors are numpy arrays."""
+    """Return the values by name, with arrays and tensors converted to numpy arrays."""
     return {name: portable(value) if is_array(value) else value for name, value in values.items()}
 
 

@@ -1,4 +1,4 @@
-"""Endless transitions from the workers of an evaluation."""
+"""An endless sequence of transitions from the workers of an evaluation."""
 
 from __future__ import annotations
 
@@ -31,15 +31,16 @@ from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs
 from vlagents_ray_learn.columns import FINAL, REPLAY, at_rows, tensors
 from vlagents_ray_learn.optional import optional
 
-WANTED = ("logprob", "value", "entropy", REPLAY)  # columns that a policy fills
+WANTED = ("logprob", "value", "entropy", REPLAY)  # columns whose values the policy returns
 
-# Rows that are allocated first; the system provides the memory only when it is written.
+# The number of rows that are allocated initially. The system provides the memory only when it is
+# written.
 _FIRST_ROWS = 128
-_OTHER_MEMBERS = 2**31  # added to the policy seeds of a group's further members
+_OTHER_MEMBERS = 2**31  # added to the policy seeds of the other members of a group
 
 
 class TransitionRecorder(EpisodeRecorder):
-    """Keeps the transitions of one episode, as `vlagents_ray_learn.columns` describes them."""
+    """Records the transitions of one episode in the columns of `vlagents_ray_learn.columns`."""
 
     def __init__(self, _hz: float | None, *, want: Sequence[str] = (), images: bool = True) -> None:
         self._pa: Any = optional("pyarrow")
@@ -47,27 +48,28 @@ class TransitionRecorder(EpisodeRecorder):
         self._images = images
         self.request_info: Mapping[str, Any] = {WANT: list(want)} if want else {}
         self._observed: dict[str, _Rows] = {}  # the columns of the observations
-        # For each step: action, reward, success, number of the answer, version, source.
+        # The action, reward, success, number of the answer, version and source of each step.
         self._rows: list[tuple[np.ndarray, float, bool, int, int, str]] = []
         # The requested columns with a number for each step.
         self._wanted: dict[str, list[float]] = {name: [] for name in self._want if name != REPLAY}
         self._replay: dict[str, _Rows] = {}  # a row for each answer of which a row was executed
 
         # The current answer of the policy.
-        self._acts = 0  # number of answers up to it
+        self._acts = 0  # number of answers so far, including the current one
         self._version, self._source = 0, "policy"
-        self._next: dict[str, list[float]] = {}  # requested numbers of its remaining rows
-        self._next_replay: dict[str, np.ndarray] = {}  # until its first row is executed
+        self._next: dict[str, list[float]] = {}  # requested numbers of the answer's remaining rows
+        # Replay values of the answer until its first row is executed.
+        self._next_replay: dict[str, np.ndarray] = {}
 
     @property
     def wants_images(self) -> EpisodeChoice:
         return "all" if self._images else "none"
 
     def add_observation(self, obs: Obs) -> None:
-        """Add the observation before an action, or after the last one.
+        """Add the observation before an action, or after the last action.
 
         Raises:
-            EnvFailed: Its names or shapes differ from those of the first observation.
+            EnvFailed: The names or shapes differ from the first observation.
         """
         values: dict[str, Any] = {}
         if self._images:
@@ -88,7 +90,7 @@ class TransitionRecorder(EpisodeRecorder):
             self._observed[name].add(value)
 
     def add_act(self, act: Act, ticks_waited: int = 0) -> None:
-        """Add an answer of the policy, before its rows are executed.
+        """Add an answer of the policy before its rows are executed.
 
         Raises:
             ConfigError: A requested value is missing or has a wrong shape.
@@ -131,8 +133,8 @@ class TransitionRecorder(EpisodeRecorder):
         """Return the replay values of an answer by name.
 
         Raises:
-            ConfigError: They are not numbers or arrays of numbers, or their shapes or dtypes differ
-                from those of the first answer.
+            ConfigError: The values are not numbers or arrays of numbers, or their shapes or dtypes
+                differ from the first answer.
         """
         field = f"act.info[{BEHAVIOUR!r}][{REPLAY!r}]"
         by_name = sorted(replay.items()) if isinstance(replay, Mapping) else []
@@ -151,7 +153,7 @@ class TransitionRecorder(EpisodeRecorder):
         return values
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
-        """Return the transitions of an episode; none if an error of the policy ended it."""
+        """Return the transitions of the episode; None if an error of the policy ended it."""
         if result.status != "done":
             return Artifacts()
 
@@ -175,7 +177,8 @@ class TransitionRecorder(EpisodeRecorder):
         }
 
         columns: dict[str, Any] = {}
-        zeros = pa.array(np.zeros(rows, np.int32))  # indices: each row has the same text
+        # Dictionary indices, since each row has the same text.
+        zeros = pa.array(np.zeros(rows, np.int32))
         for name, text in (("key", str(result.key)), ("instruction", result.instruction)):
             columns[name] = pa.DictionaryArray.from_arrays(zeros, pa.array([text]))
         for name, values in numbers.items():
@@ -190,10 +193,10 @@ class TransitionRecorder(EpisodeRecorder):
 
 
 class _Rows:
-    """Arrays of one shape, each of which is copied into a growing array."""
+    """A growing array, into which arrays of the same shape are copied as rows."""
 
     def __init__(self, first: np.ndarray, dtype: Any) -> None:
-        """Begin without rows, with the shape of the array `first`, which is not added."""
+        """Begin without rows. The shape of a row is the shape of `first`, which is not added."""
         self.shape, self.dtype = first.shape, dtype
         self._rows = np.empty((_FIRST_ROWS, *first.shape), dtype)
         self._number = 0
@@ -238,12 +241,12 @@ def _by_row(value: Any, rows: int, name: str) -> list[float]:
     return [float(values.sum()), *[float("nan")] * (rows - 1)]
 
 
-POLL_S = 0.25  # longest wait for a report; missing workers are then started
+POLL_S = 0.25  # longest wait for a report, after which missing workers are started
 
 
 @dataclass(slots=True)
 class RolloutStats:
-    """The episodes of rollouts so far."""
+    """The numbers of episodes and transitions of rollouts so far."""
 
     episodes: int = 0  # delivered episodes
     transitions: int = 0  # steps of the delivered episodes
@@ -259,9 +262,9 @@ class _PlannedEpisode:
     job: Job  # the first attempt
     number: int
     is_over: bool = False
-    # Whether its weights were too old, and it waits until it may begin again.
+    # Whether the weights of the episode were too old, so that it waits until it may begin again.
     waits_for_restart: bool = False
-    transitions: Any = None  # once it is over; None if it is lost
+    transitions: Any = None  # transitions, once the episode is over; None if it is lost
     oldest: int = 0  # oldest version of the weights among its actions
     pushed: int = 0  # the learner's version when the last attempt began
 
@@ -274,27 +277,31 @@ class RolloutPlan:
         ConfigError: A setting is wrong.
     """
 
-    env: str | Sequence[str]  # the name, as for an evaluation; several envs alternate
-    # URL of a server, or a factory that each worker calls to create its own agent.
+    env: str | Sequence[str]  # name of the env, as for an evaluation; several envs alternate
+    # The URL of a server, or a factory that each worker calls to create its own agent.
     policy: str | Callable[[], Agent]
-    # 0 runs the episodes in this process and on this thread, without Ray. That is the fastest for
-    # one env and a small policy.
+    # The number of workers. 0 runs the episodes in this process and on this thread, without Ray,
+    # which is the fastest for one env and a small policy.
     workers: int = 1
-    # Environments that one worker steps together, with one request to the policy for all of them.
+    # The number of environments that one worker steps together, with one request to the policy for
+    # all of them.
     num_envs: int = 1
-    # Consecutive episodes from one start state, which differ in the seed of the policy (GRPO).
+    # The number of consecutive episodes from the same start state. They differ in the seed of the
+    # policy (GRPO).
     groups: int = 1
-    # Values that the policy returns with each answer: "logprob", "value", "entropy", "replay".
+    # The values that the policy returns with each answer: "logprob", "value", "entropy", "replay".
     want: Sequence[str] = ()
-    # Largest age, in versions, of the weights of any answer in a delivered episode; older episodes
-    # are run again. 0 is on-policy; None delivers all episodes.
+    # The largest age, in versions, of the weights of any answer in a delivered episode. Older
+    # episodes are run again. 0 is on-policy; None delivers all episodes.
     max_lag: int | None = 0
     seed: int = 0  # seed of the first start state; state n has `seed` + n
-    first: int = 0  # number of the first episode; to continue earlier rollouts, their `position`
+    first: int = 0  # number of the first episode; the `position` of earlier rollouts continues them
     images: bool = True  # whether there are columns for the cameras
-    env_options: Mapping[str, Any] = field(default_factory=dict)  # of the env's constructor
-    reset_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the env
-    policy_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the policy
+    env_options: Mapping[str, Any] = field(default_factory=dict)  # options of the env's constructor
+    # Options of each reset of the env.
+    reset_options: Mapping[str, Any] = field(default_factory=dict)
+    # Options of each reset of the policy.
+    policy_options: Mapping[str, Any] = field(default_factory=dict)
     execute: int | None = None  # executed rows of each action chunk; None executes all
     # Further settings of an evaluation, such as `worker`, `retries` and `env_timeout_s`.
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -338,10 +345,10 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     Episodes are numbered from 0, and each is delivered exactly once, in this order. That does not
     depend on the number of workers, and holds even if workers die: a broken attempt is repeated,
     and has no transitions. Therefore, the same seeds and weights give the same transitions. The
-    keys of the episodes are those of an evaluation with these settings.
+    keys of the episodes are the same as in an evaluation with these settings.
 
     A record batch is one whole episode, with the columns of `vlagents_ray_learn.columns`. Workers
-    on this node write it into Ray's object store once, and numpy maps it from there. A batch
+    on this node write the batch into Ray's object store once, and numpy maps it from there. A batch
     occupies memory of the store as long as it is referenced.
     """
 
@@ -369,33 +376,34 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         self._ahead = self._block * max(2, math.ceil(2 * environments / self._block))
 
         self._position = self._planned = plan.first
-        self._episodes: dict[EpisodeKey, _PlannedEpisode] = {}  # from number `position` on
+        # Episodes with numbers of at least `position`.
+        self._episodes: dict[EpisodeKey, _PlannedEpisode] = {}
         self._driver = Driver(self._plan, [], _Consumer(self))
         self._resources = ExitStack()
         self._pool: Workers | None = None
 
         # Guards all of this object's state. No thread holds it while it waits for reports.
         self._state = threading.Condition()
-        # Runs further episodes while the learner learns.
+        # The thread that runs further episodes while the learner learns.
         self._player: threading.Thread | None = None
         self._stopping = False
-        self._error: BaseException | None = None  # the error that ended the player
+        self._error: BaseException | None = None  # error that ended the thread
 
         self._version = 0  # newest version among answers and pushes
         self._pushed = 0  # version that the learner has set
         self._allowed = plan.first  # number of the first episode that may not begin yet
-        self._changed_at = plan.first  # the position when the version changed
-        # Episodes that were delivered between the last two changes of the version, and the
-        # difference between these versions.
+        self._changed_at = plan.first  # position at the last change of the version
+        # The number of episodes that were delivered between the last two changes of the version,
+        # and the difference between these versions.
         self._pace = 0, 0
-        self.stats = RolloutStats()  # the numbers of episodes so far
+        self.stats = RolloutStats()  # numbers of episodes so far
 
     @property
     def version(self) -> int:
         """The newest version of the weights, from which the lag is counted.
 
-        It follows the versions in the policy's answers. A learner that iterates may set it to the
-        result of a push. After that, no episode of older weights is delivered.
+        It follows the versions in the policy's answers. A learner that iterates over the rollouts
+        may set it to the result of a push. After that, no episode with older weights is delivered.
         """
         return self._version
 
@@ -409,7 +417,7 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     def position(self) -> int:
         """The number of the next episode.
 
-        A learner keeps it in its checkpoint, and passes it as `first` to continue.
+        A learner stores it in its checkpoint, and passes it as `first` to continue.
         """
         return self._position
 
@@ -420,26 +428,26 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         environment.
         """
         delivered: list[Any] = []
-        while not delivered:  # an episode may be lost
+        while not delivered:  # repeated, since an episode may be lost
             delivered = self._deliver(self._position + 1, self._limit())
         return delivered[0]
 
     def collect(self, episodes: int) -> Any:
-        """Run the next episodes without prefetching, so none uses outdated weights.
+        """Run the next episodes without prefetching, so that no episode uses outdated weights.
 
         Args:
             episodes: The number of episodes, a multiple of `groups`.
 
         Returns:
             Their transitions in order, a `pyarrow.Table` with a chunk for each episode. Lost
-            episodes are left out. If all of them are lost, the same number of following episodes
-            is run.
+            episodes are omitted. If all of them are lost, the same number of following episodes is
+            run.
 
         Raises:
             ConfigError: The number is not a multiple of `groups`, or the envs have different
                 columns.
-            WeightsLost: The policy acts with older weights than `version`, after a restart: push
-                them, and call again.
+            WeightsLost: The policy uses weights older than `version`, after a restart. Push the
+                weights, and call again.
             VLAgentsError: The last infrastructure error, after `abort_after` consecutive lost
                 episodes.
         """
@@ -449,7 +457,7 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
                 "episodes"
             )
         batches: list[Any] = []
-        while not batches:  # all may be lost
+        while not batches:  # repeated, since all episodes may be lost
             batches = self._deliver(self._position + episodes)
         try:
             return self._pa.Table.from_batches(batches)
@@ -459,10 +467,13 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             ) from error
 
     def close(self) -> None:
-        """End the workers, and the Ray cluster if it was started for them; safe to call twice.
+        """End the workers, and the Ray cluster if it was started for them.
 
-        Delivered transitions are in Ray's memory: copy those that are needed after Ray has ended.
-        A later call starts workers again, which repeat the episodes that were not delivered.
+        Calling this twice is safe.
+
+        Delivered transitions are in Ray's memory. Copy the transitions that are needed after Ray
+        has ended. A later call starts workers again, which repeat the episodes that were not
+        delivered.
         """
         self._stop_player()
         if self._pool is not None:
@@ -480,7 +491,7 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         self._stop_player()
         for episode in self._episodes.values():
             episode.is_over = episode.waits_for_restart = False
-            episode.transitions = None  # Ray, whose memory it is in, may end
+            episode.transitions = None  # dropped, since Ray, whose memory contains it, may end
         self._pool = self._error = None
         self._resources.__exit__(*exc)
 
@@ -488,12 +499,13 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         """Return the number of the first episode that may not begin yet.
 
         If the learner pushes at the pace of its last push, an episode with a higher number would be
-        too old when it is delivered. Without this limit, a learner that was slow once would get
-        every later episode only at the second run.
+        too old when it is delivered. Without this limit, after one slow step of the learner, every
+        later episode would have to be run twice.
         """
         limit = (self._position + 1) // self._block * self._block + self._ahead
         episodes, versions = self._pace
-        is_slower = self._position >= self._changed_at + episodes  # than before the last push
+        # Slower than before the last push.
+        is_slower = self._position >= self._changed_at + episodes
         if self._settings.max_lag is None or is_slower:
             return limit
         fresh_episodes = episodes * (1 + self._settings.max_lag // versions)
@@ -510,12 +522,13 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         self._version = version
 
     def _deliver(self, end: int, limit: int | None = None) -> list[Any]:
-        """Run the episodes before number `end`, and return the transitions of those not lost.
+        """Run the episodes before number `end`, and return the transitions of all episodes that are
+        not lost.
 
         Args:
             end: The number of the first episode that is not delivered.
             limit: The number of the first episode that may not begin; None selects `end`. Episodes
-                between the two continue after this returns.
+                between `end` and `limit` continue after this method returns.
         """
         try:
             prefetches = limit is not None and self._settings.workers > 0
@@ -551,8 +564,8 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     def _start_player(self) -> None:
         if self._player is None:
             self._stopping = False
-            # Start the workers on this thread: Ray, which may be started for them, sets handlers
-            # of signals.
+            # The workers are started on this thread, since Ray, which may be started for them, sets
+            # signal handlers.
             self._running_pool()
             self._player = threading.Thread(target=self._run_ahead, name="rollouts", daemon=True)
             self._player.start()
@@ -576,7 +589,7 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
                     if self._stopping:
                         return
                 self._run_queued()
-        except BaseException as error:  # noqa: BLE001 - the next call raises it
+        except BaseException as error:  # noqa: BLE001 - raised by the next call
             with self._state:
                 self._error = error
                 self._state.notify_all()
@@ -588,9 +601,9 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             start_state, member = divmod(number, self._settings.groups)
             episode, case_index = divmod(start_state, len(self._plan.cases))
             case = self._plan.cases[case_index]
-            # The first member of a group is the episode of an evaluation. The policy seeds of the
-            # others are above all seeds of evaluations, so that no two episodes of an environment
-            # have the same noise.
+            # The first member of a group is identical to the episode of an evaluation. The policy
+            # seeds of the other members are larger than all seeds of evaluations, so that no two
+            # episodes of an environment have the same noise.
             policy_seed = seed + _OTHER_MEMBERS + number if member else None
             key = EpisodeKey(case.env, episode, seed + episode, case.fingerprint, policy_seed)
             job = Job(key, case)
@@ -636,7 +649,9 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             self._episodes[job.key].pushed = self._pushed
 
     def _finish(self, job: Job, transitions: Any) -> None:
-        """Keep the transitions of an episode until they are delivered; None if it is lost.
+        """Store the transitions of an episode until they are delivered.
+
+        They are None if the episode is lost.
 
         Raises:
             WeightsLost: The policy has older weights than the learner has pushed.
@@ -654,7 +669,8 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         episode.oldest = int(versions.min())
         self._note_version(int(versions.max()))
 
-        # An attempt that began after the push, but has older weights, would be repeated for ever.
+        # Without this error, an attempt that began after the push but has older weights would be
+        # repeated for ever.
         max_lag = self._settings.max_lag
         if max_lag is not None and episode.pushed - episode.oldest > max_lag:
             raise WeightsLost(
@@ -667,7 +683,8 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     def _replay_stale(self) -> None:
         """Run episodes with outdated weights again, once they may begin.
 
-        The episodes are queued at the front, in their order: the last one is therefore first.
+        The episodes are put back at the front of the queue in reverse order, so that their order is
+        kept.
         """
         max_lag = self._settings.max_lag
         for episode in reversed(self._episodes.values()):
@@ -683,7 +700,7 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
 
 
 class _Consumer(Consumer):
-    """Passes the episodes of the driver to the rollouts."""
+    """A consumer that passes the episodes of the driver to the rollouts."""
 
     policy_cure = loss_cure = "mend this, and go on with `first=rollouts.position`"
 

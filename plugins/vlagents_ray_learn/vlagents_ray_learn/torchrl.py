@@ -51,7 +51,7 @@ _LEARNED = ("logprob", REPLAY)  # values of an answer that a learner needs
 class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
     """A policy on a server as a module of TorchRL.
 
-    It reads images (*B, 3, H, W) uint8, a state (*B, D) float32 and instructions. Below
+    It reads images (*B, 3, H, W) uint8, a state (*B, D) float32 and instructions. Under the key
     "vla_action", it adds "chunk" (*B, H, D) float32, or "tokens" (*B, H, D) int64 and "log_probs"
     in nats, or all three. Tokens are drawn at random if TorchRL's exploration type is RANDOM.
 
@@ -61,7 +61,7 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
     """
 
     def __init__(self, url: str, **options: Any) -> None:
-        """Set the server, to which the first call connects.
+        """Set the server. The first call connects to it.
 
         Args:
             url: The URL of the server.
@@ -99,7 +99,7 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
         return batch
 
     def _open_sessions(self, number: int) -> None:
-        """Connect at the first call, and open sessions until there are `number` of them."""
+        """Connect at the first call, and open sessions until `number` sessions are open."""
         if not self._sessions:
             agent = RemoteAgent(self._url, **self._options)
             self._sessions = [agent]
@@ -116,7 +116,7 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
         Args:
             obs: The observation of each row.
             instructions: The instruction of each row.
-            is_first: Whether each row is the first of an episode; None if that is not known.
+            is_first: Whether each row is the first of an episode; None if this is unknown.
         """
         rows = []
         for i, instruction in enumerate(instructions):
@@ -137,7 +137,7 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
             self._instructions[i] = instructions[i]
 
     def _outputs(self, answers: Sequence[Act]) -> dict[Any, list[np.ndarray]]:
-        """Return the values of all rows by TorchRL's keys."""
+        """Return the values of all rows under TorchRL's keys."""
         versions = [np.array(answer.info[POLICY]["version"], np.int64) for answer in answers]
         outputs: dict[Any, list[np.ndarray]] = {"policy_version": versions}
         if self._contract.action.space != _TOKENS:
@@ -152,7 +152,7 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
         return outputs
 
     def close(self) -> None:
-        """End the sessions; a later call opens new ones."""
+        """End the sessions. A later call opens new sessions."""
         while self._sessions:
             self._sessions.pop().close()
 
@@ -164,7 +164,7 @@ class TorchRLPolicy(TrainableAgent):
     """A VLA policy of TorchRL (`VLAWrapperBase`).
 
     It returns chunks, or tokens if it has a head of tokens and no `action_tokenizer`. The session's
-    generator draws the tokens if a learner requests values. Otherwise the likeliest tokens are
+    generator draws the tokens if a learner requests values. Otherwise, the most likely tokens are
     chosen.
     """
 
@@ -204,8 +204,8 @@ class TorchRLPolicy(TrainableAgent):
         self.policy = make().eval()
 
     def parameters(self) -> dict[str, Any]:
-        # Lazy layers get their sizes from the first batch. Before that there are no values to push
-        # or to compare.
+        # Lazy layers get their sizes from the first batch. Before the first batch, there are no
+        # values to push or to compare.
         has_lazy = any(map(torch.nn.parameter.is_lazy, self.policy.parameters()))
         return {} if has_lazy else named_values(self.policy)
 
@@ -228,7 +228,7 @@ class TorchRLPolicy(TrainableAgent):
 
         Args:
             rows: For each session, the input, and the generator that draws its tokens; None selects
-                the likeliest tokens.
+                the most likely tokens.
         """
         policy = self.policy
         device = next(policy.parameters()).device
@@ -247,7 +247,7 @@ class TorchRLPolicy(TrainableAgent):
                 noise.append(np.zeros(shape) if generator is None else generator.gumbel(size=shape))
             noise_on_device = torch.from_numpy(np.stack(noise)).to(device, logits.dtype)
             tokens = (logits + noise_on_device).argmax(-1)
-            # (B,), or (B, H, D) with `log_probs_mode="token"`.
+            # The log-probabilities, (B,), or (B, H, D) with `log_probs_mode="token"`.
             logprobs = distribution.log_prob(tokens)
             actions = tokens
             if policy.action_tokenizer is not None:
@@ -263,25 +263,25 @@ class TorchRLPolicy(TrainableAgent):
 
 
 class ServerAddress:
-    """The address of a `PolicyServer` that starts later; replaces TorchRL's `MPTransport`."""
+    """The address of a `PolicyServer` that starts later. It replaces TorchRL's `MPTransport`."""
 
     def __init__(self, **_torchrl_options: Any) -> None:
         self.port = free_port()
 
     def client(self) -> ServedPolicy:
-        """Return a client, whose first call waits for the server."""
+        """Return a client. Its first call waits for the server."""
         return ServedPolicy(f"http://127.0.0.1:{self.port}")
 
     def close(self) -> None:
-        """Do nothing: the server closes its port."""
+        """Do nothing, since the server closes its port."""
 
 
 class PolicyServer:
-    """A server of a `VLAWrapperBase`; replaces TorchRL's `ProcessInferenceServer`.
+    """A server of a `VLAWrapperBase`. It replaces TorchRL's `ProcessInferenceServer`.
 
     The server starts its own Ray. Of TorchRL's arguments, the following have an effect:
-    `server_config.max_batch_size` limits the batches, whose patience is the default of deployment
-    files, and Ray reserves a GPU for a `policy_device` "cuda".
+    `server_config.max_batch_size` limits the batch size, and Ray reserves a GPU for a
+    `policy_device` "cuda". The waiting time for batches is the default of deployment files.
     """
 
     def __init__(
@@ -306,7 +306,8 @@ class PolicyServer:
 
     def start(self) -> Self:
         """Serve the policy, and wait until it is loaded."""
-        # Processes of environments import this module for the client, which does not need Ray.
+        # Ray is imported late, since environment processes import this module for the client, which
+        # does not need Ray.
         from ray import cloudpickle
 
         from vlagents_ray.serve.launch.deployment_file import deployment
@@ -331,10 +332,10 @@ class PolicyServer:
         return self
 
     def update_model_weights(self, weights: Any, **_: Any) -> dict[str, bool]:
-        """Push new weights, with which the policy acts from now on.
+        """Push new weights, which the policy uses from now on.
 
         Args:
-            weights: A tensordict of parameters, all or some.
+            weights: A tensordict with all or some of the parameters.
 
         Raises:
             VLAgentsError: The errors of `Publisher.push`.

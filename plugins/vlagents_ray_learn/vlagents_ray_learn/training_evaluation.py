@@ -36,8 +36,8 @@ class TrainingEvaluation:
             evaluation.play_if_due(version)
 
     Results have the format of `vlagents_ray.evaluate.evaluate`, with a checkpoint for each version,
-    such as "reach@3". All versions run the same episodes. `play` returns when the evaluation is
-    over, so that the trainer pushes nothing meanwhile.
+    such as "reach@3". All versions run the same episodes. `play` blocks until the evaluation is
+    over, so that the trainer pushes no weights meanwhile.
     """
 
     def __init__(
@@ -48,15 +48,15 @@ class TrainingEvaluation:
         share: float = 0.1,
         progress: Progress | None = None,
     ) -> None:
-        """Check the plan; no episode is run yet.
+        """Check the plan. No episode is run yet.
 
         Args:
             policy: The URL of the policy's server, to which the versions are pushed, or the agent
                 that this process trains. The plan's workers run the episodes of a URL. The episodes
                 of an agent are run in this process, each with a copy of the agent that shares its
                 weights, as in a server.
-            plan: The suites, the folder of results, and one policy without `steps`: its name and
-                its options. Its `url` and `source` are ignored.
+            plan: The suites, the folder of results, and one policy with a name and options but
+                without `steps`. The policy's `url` and `source` are ignored.
             share: The fraction of the time since this call that evaluations may take, in (0, 1].
             progress: As for `evaluate`.
 
@@ -94,7 +94,7 @@ class TrainingEvaluation:
 
     @property
     def is_due(self) -> bool:
-        """Whether an evaluation as long as the last one would stay within the share.
+        """Whether an evaluation with the duration of the last one would stay within the share.
 
         The first evaluation is due at once.
         """
@@ -102,7 +102,7 @@ class TrainingEvaluation:
         return self._spent_s + self._last_s <= self._share * (elapsed_s + self._last_s)
 
     def play_if_due(self, version: int) -> Summary | None:
-        """Evaluate the policy as `play` does if an evaluation is due; otherwise return None."""
+        """If an evaluation is due, evaluate the policy as `play` does; otherwise return None."""
         return self.play(version) if self.is_due else None
 
     def play(self, version: int) -> Summary:
@@ -115,12 +115,12 @@ class TrainingEvaluation:
                 number, such as the step of training.
 
         Returns:
-            The summary of all versions so far; the newest is the last of `totals`.
+            The summary of all versions so far. The newest version is the last of `totals`.
 
         Raises:
-            WeightsLost: The policy acts with another version: push this one, and call again.
-            ConfigError: The results of this version are those of other weights, as after a restart
-                of the training.
+            WeightsLost: The policy uses another version. Push this version, and call again.
+            ConfigError: The existing results of this version belong to other weights, for example
+                after a restart of the training.
             NotTrainable: The agent names no parameters to train.
             VLAgentsError: As for `evaluate`.
         """
@@ -134,7 +134,7 @@ class TrainingEvaluation:
             self._spent_s += self._last_s
 
     def _evaluate_server(self, url: str, version: int) -> Summary:
-        """Evaluate the policy of a server, whose newest version must be this one."""
+        """Evaluate the policy of a server. The server's newest version must be this version."""
         transport, timeout_s = self._plan.policies[0].transport, self._plan.connect_timeout_s
         with RemoteAgent(url, transport=transport, connect_timeout_s=timeout_s) as remote:
             newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
@@ -190,7 +190,9 @@ class _EvaluatedSession(Agent):
         return self._copy.reset(obs, instruction, **kwargs)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Act with the sessions' copies, and add the version of the weights to each answer."""
+        """Compute the answers of the sessions' copies, and add the version of the weights to
+        each answer.
+        """
         copies = [session._copy for session in sessions if isinstance(session, _EvaluatedSession)]
         acts: list[Act | Exception] = []
         for act in self._trained.act_batch(obs, copies):

@@ -1,4 +1,6 @@
-"""Environments as a `gymnasium.vector.VectorEnv`, for learners that step them themselves."""
+"""Environments as a `gymnasium.vector.VectorEnv`, for learners that step the environments
+themselves.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ _RESET_MASK = "reset_mask"  # Gymnasium's name of the option
 
 
 def action_space(contract: Contract) -> Any:
-    """Return the space of one environment's actions, Box (D,) float32 within the contract's bounds.
+    """Return the action space of one environment, a Box (D,) of float32 within the contract's
+    bounds.
 
     Raises:
         ConfigError: The contract does not define D.
@@ -92,7 +95,7 @@ def observed(obs: Obs, observation: Observation) -> Any:
 
 
 def _size(size: int | None, field: str) -> int:
-    """Return a size of the contract; raises `ConfigError` if the contract does not define it."""
+    """Return a size from the contract; raises `ConfigError` if the contract does not define it."""
     if size is None:
         raise ConfigError(
             f"{field}: expected it in the env's contract, as Gymnasium needs it, got none; add it "
@@ -160,7 +163,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
     and each new episode has the next number. A reset without a seed continues with the next
     numbers. If the first reset has no seed, S is drawn at random.
 
-    `infos["success"]` is whether the task is solved. `infos["instruction"]` and
+    `infos["success"]` contains whether the task is solved. `infos["instruction"]` and
     `infos["episode_seed"]` are set whenever an episode begins. If the episodes have several tasks,
     `infos["instruction"]` is also set after each step. The environment's step limit truncates an
     episode.
@@ -202,7 +205,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         self._seed: int | None = None  # seed of episode 0
         self._begun = 0  # number of episodes up to now
         self._over = np.zeros(self.num_envs, np.bool_)  # whether the episode is over
-        self._steps = np.zeros(self.num_envs, np.int64)  # steps of the episode
+        self._steps = np.zeros(self.num_envs, np.int64)  # number of steps in the episode
         # The current observation of each environment; empty before the first reset.
         self._obs: list[Obs] = []
 
@@ -216,8 +219,8 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
 
         Args:
             seed: The seed S of episode 0; None continues with the next numbers. As in Gymnasium, a
-                list has a seed for the episode of each environment; later episodes continue after
-                the largest of them.
+                list contains a seed for each environment's episode. Later episodes continue after
+                the largest of these seeds.
             options: Options of the environments' resets. With Gymnasium's option `reset_mask`,
                 (N,) bool, only these environments begin an episode.
 
@@ -239,7 +242,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             super().reset(seed=seeds[0])
 
         if seeds is not None:
-            # The next episode, number len(seeds), has the seed after the largest one.
+            # The seed of the next episode, number len(seeds), is the largest seed plus 1.
             self._seed, self._begun = max(seeds) + 1 - len(seeds), 0
         elif isinstance(seed, int):
             self._seed, self._begun = seed, 0
@@ -254,7 +257,8 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         """Return the environments in which a reset begins an episode, (N,) bool.
 
         Raises:
-            ConfigError: The option is not None, and not a mask that selects an environment.
+            ConfigError: The option is neither None nor a mask that selects at least one
+                environment.
         """
         if mask is None:
             return np.ones(self.num_envs, np.bool_)
@@ -378,9 +382,9 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         """Begin an episode in some environments.
 
         Args:
-            mask: Whether to begin one in each environment, (N,) bool.
-            infos: Gets the instructions and the seeds.
-            env_options: Options of the resets, besides `reset_options`.
+            mask: The environments in which an episode begins, (N,) bool.
+            infos: The infos, to which the instructions and the seeds are added.
+            env_options: Options of the resets, in addition to `reset_options`.
             chosen_seeds: The seeds of the episodes; None continues with the next numbers.
         """
         assert self._seed is not None  # noqa: S101 - `reset` has set it
@@ -417,7 +421,9 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             self._add_info(infos, {"instruction": instructions[i], "episode_seed": seed}, i)
 
     def _observations(self) -> Any:
-        """Return the current observations of all environments as a member of their space."""
+        """Return the current observations of all environments as a member of the observation
+        space.
+        """
         rows = [observed(obs, self._observation) for obs in self._obs]
         if self._observation == "state":
             return np.stack(rows)
@@ -431,7 +437,7 @@ def _masked_seeds(seeds: Sequence[int | None], mask: np.ndarray) -> list[int]:
     """Return the seeds of the environments that begin an episode.
 
     Args:
-        seeds: A seed for each environment, N; those of the others may be None.
+        seeds: N seeds, one for each environment. The seeds of the other environments may be None.
         mask: Whether each environment begins an episode, (N,) bool.
 
     Raises:

@@ -1,12 +1,12 @@
-"""New weights for all replicas: every replica holds a version before any replica acts with it.
+"""Pushes of new weights to all replicas.
 
-The replica that receives a push coordinates it. It stages the version at all replicas, and commits
-it only if all of them hold it. Otherwise it drops the version, and nothing has changed.
-
-A replica that starts later, or that has missed a commit, gets the versions of the others
+Every replica stores a version before any replica uses it. The replica that receives a push
+coordinates it. The coordinator stages the version at all replicas, and commits the version only if
+all replicas have stored it. Otherwise, the coordinator drops the version, and nothing has changed.
+A replica that starts later, or that has missed a commit, gets the versions from the other replicas
 (`WeightPusher.catch_up`). If the coordinator dies before the first commit, the replicas drop the
-staged version by themselves. If it dies between two commits, the replicas without a commit catch
-up.
+staged version by themselves. If the coordinator dies between two commits, the replicas without a
+commit catch up.
 """
 
 from __future__ import annotations
@@ -30,16 +30,18 @@ from vlagents_ray.serve.weights import (
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
 
 Values = Mapping[str, Any] | list[Awaitable[Mapping[str, Any]]] | SharedValues
-"""The values of a push: a mapping by name; or a list of one reference to such a mapping in Ray's
-object store, which each replica reads in place; or handles of a learner's memory on the GPU of all
-replicas."""
+"""The values of a push.
+
+They are a mapping by name; or a list with one reference to such a mapping in Ray's object store,
+which each replica reads in place; or handles of a learner's memory on the GPU of all replicas.
+"""
 
 logger = logging.getLogger(__name__)
 
-# Largest difference from one version to the next if a learner chooses the numbers, such as the step
-# of its training.
+# The largest difference between consecutive versions if a learner chooses the numbers, such as the
+# steps of its training.
 _MOST_AHEAD = 10**9
-_ATTEMPTS = 3  # attempts to commit at a replica that cannot be reached
+_ATTEMPTS = 3  # number of attempts to commit at a replica that cannot be reached
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +49,8 @@ class PushResult:
     """The result of a successful push."""
 
     version: int
-    fingerprint: str  # the same at all replicas
-    replicas: tuple[str, ...]  # names of the replicas that act with the version
+    fingerprint: str  # fingerprint, the same at all replicas
+    replicas: tuple[str, ...]  # names of the replicas that use the version
 
 
 class WeightsReplica(Protocol):
@@ -58,13 +60,13 @@ class WeightsReplica(Protocol):
     does not answer.
     """
 
-    name: str  # for messages
+    name: str  # name of the replica, for messages
 
     async def newest(self) -> NewestVersion:
         """Return the newest version of the replica."""
 
     async def stage(self, number: int, values: Values, options: PushOptions) -> str:
-        """Check and hold a new version, and return its fingerprint."""
+        """Check and store a new version, and return its fingerprint."""
 
     async def commit(self, number: int, options: PushOptions) -> None:
         """Use the staged version."""
@@ -73,14 +75,17 @@ class WeightsReplica(Protocol):
         """Drop the staged version."""
 
     async def pushed_versions(self) -> list[HeldVersion]:
-        """Return the versions that a replica that has missed them needs."""
+        """Return the versions for a replica that has missed them."""
 
     async def rest(self, rest: Rest) -> None:
-        """Let the replica sleep, restore its memory, or wake."""
+        """Make the replica sleep, restore its memory, or wake."""
 
 
 class ThisReplica(WeightsReplica):
-    """The local replica as the target of a push. Calls may be slow: they run on other threads."""
+    """The local replica as the target of a push.
+
+    Calls run on other threads, since they may be slow.
+    """
 
     def __init__(self, name: str, updates: WeightUpdates) -> None:
         self.name, self._updates = name, updates
@@ -89,7 +94,7 @@ class ThisReplica(WeightsReplica):
         return await asyncio.to_thread(self._updates.newest)
 
     async def stage(self, number: int, values: Values, options: PushOptions) -> str:
-        """Check and hold a new version, after values in Ray's object store have been fetched."""
+        """Check and store a new version. Values in Ray's object store are fetched first."""
         if isinstance(values, list):
             [reference] = values
             values = await reference
@@ -120,25 +125,26 @@ class WeightPusher:
 
         Args:
             this_replica: The replica in this process.
-            siblings: Returns the other replicas; it is called for each push.
+            siblings: A function that returns the other replicas. It is called for each push.
         """
         self._this_replica, self._siblings = this_replica, siblings
         self._pushing = asyncio.Lock()
-        self._answered: set[str] = set()  # names of replicas that have answered the last call
+        self._answered: set[str] = set()  # names of the replicas that answered the last call
 
     async def push(self, values: Values, options: PushOptions) -> PushResult:
-        """Make all replicas act with new weights, or none of them.
+        """Make all replicas use new weights, or none of them.
 
         Args:
             values: The new weights.
             options: The options of `Publisher.push`.
 
         Returns:
-            The version, and the replicas that act with it. Replicas that have ended meanwhile are
-            left out, and so are replicas that did not commit and will catch up.
+            The version, and the replicas that use it. Replicas that have ended meanwhile are not
+            included, nor are replicas that did not commit and will catch up.
 
         Raises:
-            InvalidInput: The number of the version is not above the newest one, or far above it.
+            InvalidInput: The number of the version is not above the newest number, or is far above
+                it.
             InvalidWeights: The replicas hold different values.
             NotShared: The GPU of the values is not readable by a replica.
             PolicyUnavailable: A replica cannot be reached; nothing was changed.
@@ -195,15 +201,17 @@ class WeightPusher:
                     f"{sorted(different)}; push them again"
                 )
         except BaseException:
-            # Only where staging succeeded: where it failed, another push may have staged a version
-            # of the same number.
+            # The version is dropped only where staging succeeded. Where it failed, another push may
+            # have staged a version with the same number.
             drops = [replica.drop(number) for replica in fingerprints]
             await asyncio.gather(*drops, return_exceptions=True)
             raise
         return fingerprints
 
     async def rest(self, rest: Rest) -> None:
-        """Let all replicas sleep, restore their memory, or wake; if one cannot sleep, none does.
+        """Make all replicas sleep, restore their memory, or wake.
+
+        If one replica cannot sleep, none does.
 
         Raises:
             PolicyUnavailable: A replica cannot be reached.
@@ -234,7 +242,8 @@ class WeightPusher:
             raise error
 
     async def catch_up(self) -> None:
-        """Get the newest versions of the other replicas if they are newer than this replica's.
+        """Get the newest versions from the other replicas if they are newer than this replica's
+        version.
 
         A replica calls this before it is ready, and regularly, since it may have missed a commit.
         """
@@ -246,7 +255,7 @@ class WeightPusher:
                 try:
                     newest = await replica.newest()
                 except (PeerEnded, PeerUnreachable, VLAgentsError):
-                    continue  # the replica has no newer version
+                    continue  # The other replica has no newer version.
                 if newest.number > best.number and newest.model == current.model:
                     best, source = newest, replica
             if source is None:
@@ -266,9 +275,9 @@ class WeightPusher:
             logger.info("took version %d of the weights from %s", best.number, source.name)
 
     async def _commit(self, replica: WeightsReplica, number: int, options: PushOptions) -> bool:
-        """Commit at one replica, and return whether it acts with the version.
+        """Commit at one replica, and return whether the replica uses the version.
 
-        A replica that does not act with it will catch up.
+        A replica that does not use it will catch up.
         """
         for _ in range(_ATTEMPTS):
             try:
@@ -314,7 +323,7 @@ def _number_of_push(newest: Iterable[NewestVersion], options: PushOptions) -> in
 
     Raises:
         PolicyUnavailable: The replicas have loaded different checkpoints.
-        InvalidInput: The learner's number is not above the newest one, or far above it.
+        InvalidInput: The learner's number is not above the newest number, or is far above it.
     """
     versions = list(newest)
     if len({version.model for version in versions}) > 1:

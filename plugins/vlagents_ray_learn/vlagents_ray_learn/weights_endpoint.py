@@ -10,10 +10,10 @@
 
 A connection is one push, and the push ends with the connection. Therefore, all parts of a push
 reach one replica, and no data of a push remain if its learner dies. A learner sends the values
-after the header is acknowledged. At most 16 of its parts, 1 MiB each, are unacknowledged, so that
-no proxy on the path buffers many. The header is checked against the policy's weights before memory
-is allocated, so that their size bounds the push. Keys need the scope "weights". Without keys, only
-processes of this machine may push.
+after the header is acknowledged. At most 16 parts, 1 MiB each, are unacknowledged, so that no proxy
+on the path buffers many parts. The header is checked against the policy's weights before memory is
+allocated, so that the size of these weights bounds the push. Keys need the scope "weights". Without
+keys, only processes of this machine may push.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ from vlagents_ray_learn.weight_push import PushResult
 logger = logging.getLogger(__name__)
 
 PATH = "/v1/weights"
-PART = "weights"  # name of the replica's part that has these routes, as it is registered
+PART = "weights"  # registered name of the replica's part that has these routes
 LEAST_RATE = 2**18  # minimum average rate of a push, bytes/s, since it blocks other pushes
 _SCOPE = "weights"
 _DIGITS = 20  # maximum number of digits of a version's number
-_BOOLEANS = {"true": True, "false": False}  # in the query of a URL
+_BOOLEANS = {"true": True, "false": False}  # values in the query of a URL
 
 
 class ReceivesWeights(Protocol):
@@ -65,11 +65,11 @@ class ReceivesWeights(Protocol):
         """Return the types and shapes of the announced values.
 
         Raises:
-            InvalidWeights: They do not fit the policy.
+            InvalidWeights: The values do not fit the policy.
         """
 
     async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
-        """Make all replicas act with new weights, whose `values` are arrays by name."""
+        """Make all replicas use new weights. `values` contains arrays by name."""
 
     async def rest_all(self, rest: Rest) -> None:
         """Make all replicas sleep, restore their memory, or wake."""
@@ -86,8 +86,8 @@ def weights_routes(
     Args:
         replicas: Receives the weights.
         slow_s: The maximum time until the next part of a push arrives, s.
-        open_to_network: Whether other machines reach the server without a key; pushes are then
-            rejected.
+        open_to_network: Whether other machines can reach the server without a key. In this case,
+            pushes are rejected.
     """
     endpoint = _WeightsEndpoint(replicas, slow_s, open_to_network)
     return [
@@ -98,7 +98,7 @@ def weights_routes(
 
 
 class _WeightsEndpoint:
-    """The handlers of the routes; at most one push is received at a time."""
+    """The handlers of the routes. At most one push is received at a time."""
 
     def __init__(self, replicas: ReceivesWeights, slow_s: float, open_to_network: bool) -> None:
         self._replicas, self._slow_s = replicas, slow_s
@@ -111,7 +111,7 @@ class _WeightsEndpoint:
         return JSONResponse({"versions": await self._replicas.versions()})
 
     async def rest(self, http: HttpRequest) -> Response:
-        """Make the replicas sleep, restore their memory, or wake, as the path says."""
+        """Make the replicas sleep, restore their memory, or wake, depending on the path."""
         self._scopes.require(_SCOPE)
         rest = _read_rest(http.path_params["step"], http.query_params)
         caller = current_caller()
@@ -142,12 +142,12 @@ class _WeightsEndpoint:
             logger.exception("a push of weights failed")
             answer = problem(VLAgentsError("internal error; the server's log has the details"))
 
-        with suppress(WebSocketDisconnect, RuntimeError):  # the learner has disconnected
+        with suppress(WebSocketDisconnect, RuntimeError):  # The learner has disconnected.
             await socket.send_text(json.dumps(answer))
             await socket.close()
 
     async def _receive_push(self, socket: WebSocket) -> dict[str, Any]:
-        """Receive the weights of a push, make the replicas act with them, and return the answer."""
+        """Receive the weights of a push, make the replicas use them, and return the answer."""
         if self._receiving:
             raise Overloaded(
                 "weights: another push is in progress here; push again when it has ended"
@@ -174,7 +174,7 @@ class _WeightsEndpoint:
                         f"may wait, got {reader.received} in {elapsed_s:.0f} s"
                     )
 
-            # All values have arrived: the push no longer depends on the learner's connection.
+            # All values have arrived, so the push no longer depends on the learner's connection.
             pushed = await asyncio.shield(self._replicas.push_received(reader.values(), options))
             return {
                 "version": pushed.version,
@@ -188,8 +188,8 @@ class _WeightsEndpoint:
         """Return the next message: the header, or a part of the values.
 
         Raises:
-            MalformedMessage: None arrives in time, or it is empty or a text.
-            MessageTooLarge: It is too long.
+            MalformedMessage: No message arrives in time, or the message is empty or a text.
+            MessageTooLarge: The message is too long.
             WebSocketDisconnect: The learner has disconnected.
         """
         try:
@@ -217,7 +217,7 @@ class _WeightsEndpoint:
 
 
 def _read_rest(step: Any, query: Mapping[str, str]) -> Rest:
-    """Return a step between acting and acting again.
+    """Return the requested step: sleeping, restoring memory or waking.
 
     Args:
         step: "sleep", "restore" or "wake".

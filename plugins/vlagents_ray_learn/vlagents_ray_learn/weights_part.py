@@ -1,10 +1,10 @@
 """The part of a replica that accepts new weights.
 
 It has the routes for learners on other machines, the methods for learners in the cluster, and the
-methods that the replicas call at one another.
+methods that the replicas call on each other.
 
-The part is on by default. `parts: {weights: null}` in a deployment file turns it off: the server
-then serves its checkpoints, and accepts no pushes.
+The part is enabled by default. `parts: {weights: null}` in a deployment file disables it: the
+server then serves its checkpoints, and accepts no pushes.
 """
 
 from __future__ import annotations
@@ -39,32 +39,33 @@ from vlagents_ray_learn.weights_endpoint import PATH, weights_routes
 
 logger = logging.getLogger(__name__)
 
-# Interval of the checks whether this replica has missed a version of the weights.
+# The interval at which the replica checks whether it has missed a version of the weights.
 _CATCH_UP_S = 10.0
-_ANSWER_S = 3.0  # time limit for an answer; a replica that is loading does not answer
+_ANSWER_S = 3.0  # time limit for an answer, since a replica that is loading does not answer
 _TRANSFER_S = 600.0  # time limit for the answer to a call that contains weights
 _SUMMARY = (
     "New weights from a learner, with a key of the scope `weights`; see "
     "`vlagents_ray_learn.Publisher`. The versions that act."
-)  # of the routes, for `GET /docs`
+)  # description of the routes, for `GET /docs`
 
 
 class WeightsPart(ReplicaPart):
     """Accepts new weights from learners for all replicas of the application.
 
-    Learners call `push`, `rest_all` and `versions` at any replica. That replica coordinates the
-    others, at which it calls `newest`, `stage`, `commit`, `drop`, `pushed_versions` and `rest`.
+    Learners call `push`, `rest_all` and `versions` of any replica. That replica coordinates the
+    other replicas, and calls their `newest`, `stage`, `commit`, `drop`, `pushed_versions` and
+    `rest`.
     """
 
     sibling_methods: ClassVar[Mapping[str, float | None]] = {
-        # For the replica that coordinates a push.
+        # Methods for the replica that coordinates a push.
         "newest": _ANSWER_S,
         "stage": _TRANSFER_S,
         "commit": _ANSWER_S,
         "drop": _ANSWER_S,
         "pushed_versions": _TRANSFER_S,
         "rest": _TRANSFER_S,
-        # For learners in the cluster, which set the time limits of these calls.
+        # Methods for learners in the cluster, which set the time limits of these calls.
         "push": None,
         "rest_all": None,
         "versions": None,
@@ -84,11 +85,11 @@ class WeightsPart(ReplicaPart):
         )
 
     async def before_ready(self) -> None:
-        """Get the versions of the other replicas, so that all act with the same ones."""
+        """Get the versions of the other replicas, so that all replicas use the same versions."""
         await self._catch_up()
 
     async def run(self) -> None:
-        """Get the versions of the other replicas whenever this replica has missed one."""
+        """Get the versions of the other replicas whenever this replica has missed a version."""
         while True:
             await asyncio.sleep(_CATCH_UP_S)
             await self._catch_up()
@@ -102,17 +103,17 @@ class WeightsPart(ReplicaPart):
         """Return the paths for learners, for `GET /docs` and for a `Publisher`."""
         return {"paths": [f"WS {PATH}", f"GET {PATH}"], "summary": _SUMMARY}
 
-    # For learners, which call any replica.
+    # The following methods are for learners, which call any replica.
 
     async def push(self, values: Values, options: PushOptions) -> PushResult:
-        """Make all replicas act with new weights, or none of them."""
+        """Make all replicas use new weights, or none of them."""
         begun = time.perf_counter()
         result = await self._pusher.push(values, options)
         self._push_ms.observe(1e3 * (time.perf_counter() - begun))
         return result
 
     async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
-        """Make all replicas act with new weights, which this one has received over the network."""
+        """Make all replicas use new weights that this replica has received over the network."""
         if not await self._other_replicas():
             return await self.push(values, options)
         # The values are copied on another thread, so that robots on this event loop do not wait.
@@ -126,12 +127,12 @@ class WeightsPart(ReplicaPart):
             The types and shapes of the announced values, by name.
 
         Raises:
-            InvalidWeights: They do not fit the policy.
+            InvalidWeights: The values do not fit the policy.
         """
         return self._updates.current().read_header(header, options)
 
     async def rest_all(self, rest: Rest) -> None:
-        """Let all replicas sleep, restore their memory, or wake."""
+        """Make all replicas sleep, restore their memory, or wake."""
         await self._pusher.rest(rest)
 
     async def versions(self) -> list[int]:
@@ -141,14 +142,15 @@ class WeightsPart(ReplicaPart):
         answers = await asyncio.gather(*calls, return_exceptions=True)
         return [newest.number for newest in answers if isinstance(newest, NewestVersion)]
 
-    # For the replica that coordinates a push or a rest, or that catches up; see `WeightUpdates`.
+    # The following methods are for the replica that coordinates a push or a rest, or that catches
+    # up; see `WeightUpdates`.
 
     def newest(self) -> NewestVersion:
         """Return the newest version of this replica."""
         return self._updates.newest()
 
     async def stage(self, number: int, values: Values, options: PushOptions) -> str:
-        """Check and hold a new version at this replica, and return its fingerprint."""
+        """Check and store a new version at this replica, and return its fingerprint."""
         return await self._this_replica.stage(number, values, options)
 
     def commit(self, number: int, options: PushOptions) -> None:
@@ -160,18 +162,18 @@ class WeightsPart(ReplicaPart):
         self._updates.drop(number)
 
     def pushed_versions(self) -> list[HeldVersion]:
-        """Return the versions that a replica that has missed them needs."""
+        """Return the versions for a replica that has missed them."""
         return self._updates.pushed_versions()
 
     def rest(self, rest: Rest) -> None:
-        """Let this replica sleep, restore its memory, or wake."""
+        """Make this replica sleep, restore its memory, or wake."""
         self._updates.rest(rest)
 
     async def _other_replicas(self) -> list[WeightsReplica]:
         return [_OtherReplica(sibling) for sibling in await self.siblings()]
 
     async def _catch_up(self) -> None:
-        """Get missed versions; an error is logged, and the next check tries again."""
+        """Get missed versions. An error is logged, and the next check tries again."""
         try:
             await self._pusher.catch_up()
         except Exception:
@@ -181,7 +183,7 @@ class WeightsPart(ReplicaPart):
 
 
 class _OtherReplica(WeightsReplica):
-    """Another replica as the target of a push, which is reached through its `WeightsPart`."""
+    """Another replica as the target of a push. It is reached through its `WeightsPart`."""
 
     def __init__(self, sibling: SiblingPart) -> None:
         self.name, self._sibling = sibling.name, sibling

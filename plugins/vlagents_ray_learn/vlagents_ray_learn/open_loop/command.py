@@ -1,4 +1,4 @@
-"""`vlagents-ray open-loop`: a policy's errors on a dataset."""
+"""The command `vlagents-ray open-loop`, which computes a policy's errors on a dataset."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def open_loop_command(
     horizon are printed, and written as JSON.
     """
     with errors():
-        # Imported late, so that the help of the command line is fast.
+        # These modules are imported late, so that the help of the command line is fast.
         from vlagents_ray.evaluate.artifacts.storage import require_folder
         from vlagents_ray.recorded_dataset import Names
         from vlagents_ray_learn.open_loop.comparison import (

@@ -1,6 +1,6 @@
-"""The comparison of a policy's actions with those of datasets.
+"""The comparison of a policy's actions with the recorded actions of datasets.
 
-Several sessions run at once, so that the policy answers in batches.
+Several sessions run at the same time, so that the policy answers in batches.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ from vlagents_ray.serve.weights import OPTION
 OpenSession = Callable[[], Agent]  # the caller closes the session
 
 FILE = "open_loop.json"
-_WORST_FRAMES = 10  # number of frames that the result lists
-# Recorded options of a reset that select weights of the recorded policy. Other policies lack them.
+_WORST_FRAMES = 10  # number of worst frames that the result lists
+# Recorded options of a reset that select weights of the recorded policy. Other policies do not have
+# these weights.
 _CHOICES_OF_WEIGHTS = (CHOICE, STEP, OPTION)
 
 
@@ -50,7 +51,7 @@ def candidate(source: str, overrides: Sequence[Override] = ()) -> Iterator[OpenS
 
     Args:
         source: The name of a policy, a deployment file, or the URL of a server.
-        overrides: Changes of the policy's args, unless a server has it.
+        overrides: Changes of the policy's args. They are not allowed for the policy of a server.
 
     Yields:
         A function that opens sessions, which share the policy's batches.
@@ -72,7 +73,9 @@ def candidate(source: str, overrides: Sequence[Override] = ()) -> Iterator[OpenS
 
 @dataclass
 class ErrorTable:
-    """Errors over the frames so far, by step of the horizon (H) and by value of an action (D)."""
+    """The errors over the frames so far, by step of the horizon (H) and by value of an action
+    (D).
+    """
 
     joints: list[str]  # names of the values of an action, D
     absolute: np.ndarray = field(init=False)  # (H, D), sums of the absolute errors
@@ -149,9 +152,9 @@ class OpenLoopPlan:
     """The settings of a comparison."""
 
     episodes: Sequence[int] | None = None  # indices in each dataset; None selects all
-    # Largest number of compared rows of a chunk; None compares all rows that both chunks have.
+    # The largest number of compared rows of a chunk. None compares all rows that both chunks have.
     horizon: int | None = None
-    # Step from one compared frame to the next, in a dataset without recorded answers.
+    # The distance from one compared frame to the next, in a dataset without recorded answers.
     stride: int = 1
     batch_size: int = 8  # number of concurrent sessions
     names: Names = field(default_factory=Names)
@@ -165,13 +168,15 @@ class OpenLoopResult:
     against: str  # "answers" recorded by a server, or "actions" of the dataset
     table: ErrorTable
     sessions: int = 0
-    # Calls that the recording lacks. A policy with a history has received less than when recorded.
+    # The number of calls that are missing in the recording. A policy with a history has therefore
+    # received fewer observations than in the recording.
     missing: int = 0
-    # For each frame: "dataset", "episode", "frame", and the "mae" of its chunk.
+    # For each frame: "dataset", "episode", "frame", and "mae", the mean absolute error of its
+    # chunk.
     frames: list[dict[str, Any]] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the errors of `ErrorTable`, those of each episode, and the worst frames."""
+        """Return the errors of `ErrorTable`, the errors of each episode, and the worst frames."""
         errors_of: dict[tuple[str, int], list[float]] = {}
         for frame in self.frames:
             errors_of.setdefault((frame["dataset"], frame["episode"]), []).append(frame["mae"])
@@ -225,10 +230,10 @@ def open_datasets(folder: Path) -> list[RecordedDataset]:
 def compare(
     datasets: Sequence[RecordedDataset], open_session: OpenSession, plan: OpenLoopPlan
 ) -> OpenLoopResult:
-    """Query a policy at each frame, and compare its actions with those of the dataset.
+    """Query a policy at each frame, and compare its actions with the actions of the dataset.
 
     A session is reset with its first recorded observation, its instruction and its options. It then
-    receives each of its observations in order, whatever its answers are.
+    receives its recorded observations in order, regardless of its answers.
 
     Args:
         datasets: The result of `open_datasets`.
@@ -239,8 +244,8 @@ def compare(
         The errors.
 
     Raises:
-        ConfigError: The actions of a dataset do not have the size of the policy's actions, or a
-            name is unknown.
+        ConfigError: The actions of a dataset and of the policy have different sizes, or a name is
+            unknown.
         PolicyFailed: The policy raised an error, or rejected an observation.
     """
     first = datasets[0]
@@ -288,7 +293,9 @@ def compare(
 
 
 def _require_same_size(expected: np.ndarray, actions: np.ndarray, episode: RecordedEpisode) -> None:
-    """Raise `ConfigError` unless the recorded and the policy's actions have as many values."""
+    """Raise `ConfigError` unless the recorded actions and the policy's actions have the same
+    number of values.
+    """
     if actions.shape[1] != expected.shape[1]:
         raise ConfigError(
             f"{episode.dataset.root}: its actions have {expected.shape[1]} numbers, those of the "
@@ -320,7 +327,9 @@ def _answers(
 
 
 def write_result(result: OpenLoopResult, policy: str, folder: Path) -> Path:
-    """Write `open_loop.json` into a folder, which is created if needed; return its path."""
+    """Write `open_loop.json` into a folder, which is created if needed, and return the path of
+    the file.
+    """
     with storing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with whole(folder / FILE) as path:
