@@ -65,4 +65,7 @@ def test_both_replicas_act_with_what_the_learner_hands_over(
             assert weights.push(learner.state_dict()) == 4
             assert acted() == {(4, 4)}
             assert sent[-2:] == [SharedValues, list]
-            assert "the weights are sent through Ray's object store: replica SERVE_REPLICA" in caplog.text
+            assert (
+                "the weights are sent through Ray's object store: replica SERVE_REPLICA"
+                in caplog.text
+            )
