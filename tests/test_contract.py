@@ -133,7 +133,7 @@ def test_joints_in_another_order_are_found_by_the_names_that_both_sides_have() -
         Contract(action=ActionSpec(names=("left_lift", "left_pan", "right_pan"))), env
     )
     assert found[0] == (
-        "action.names: number 0 is 'left_lift' of the policy and 'left_pan' of the env; use one "
+        "action.names: number 0 is 'left_lift' in the policy and 'left_pan' in the env; use the same "
         "order"
     )
     assert len(found) == 2
@@ -262,7 +262,7 @@ def test_a_number_that_is_too_large_for_any_unit_is_found_wherever_it_is(
         check_action(action, None)
         action[at] = sign * 1e30
         with pytest.raises(
-            InvalidAction, match=r"expected numbers of at most 1e\+09, got one of size 1e\+30"
+            InvalidAction, match=r"expected numbers of at most 1e\+09, got a number of size 1e\+30"
         ):
             check_action(action, None)
 

@@ -87,7 +87,7 @@ def test_averages_of_the_same_contract_are_it_and_of_two_are_an_error() -> None:
         first["count"] + same["count"]
     )
     assert DatasetContract.from_statistics(mean.tolist()) == ABOUT
-    with pytest.raises(ConfigError, match="merged of datasets with different contracts"):
+    with pytest.raises(ConfigError, match="merged from datasets with different contracts"):
         DatasetContract.from_statistics(((first["mean"] + changed["mean"]) / 2 - 1).tolist())
 
 

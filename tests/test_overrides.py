@@ -85,11 +85,11 @@ ERRORS: dict[str, tuple[str, str]] = {
     "not YAML": ("gain=[1", "the value of 'gain' is not YAML"),
     "new, but it is there": (
         "+gain=3",
-        r"--set \+gain=3: expected a new key, got one with the value 0.5; change it without the",
+        r"--set \+gain=3: expected a new key, got an existing key with the value 0.5; leave out the",
     ),
     "a list that is appended to, but has the entry": (
         "+envs.1=x",
-        r"expected a new key, got one with the value \{'name': 'stack'\}",
+        r"expected a new key, got an existing key with the value \{'name': 'stack'\}",
     ),
     "removed, but it is not there": (
         "~gian",

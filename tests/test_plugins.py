@@ -293,7 +293,7 @@ def test_a_robot_of_a_plugin_is_made_by_its_name_with_the_text_after_the_colon()
     assert vars(robot_factory("--robot", "arm:left")()) == {"name": "left"}
     with pytest.raises(
         ConfigError,
-        match=r"--robot lamp:left: expected a class with observe.*, got one without observe, apply, stop",
+        match=r"--robot lamp:left: expected a class with observe.*, got a class without observe, apply, stop",
     ):
         robot_factory("--robot", "lamp:left")
 

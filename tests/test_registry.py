@@ -43,7 +43,7 @@ def cure(module: str) -> str:
 
 def environments_in(text: str) -> list[str]:
     """Return the names for `vlagents-ray venv create` in a cure."""
-    _, _, several = text.partition("; NAME is that of the policy's family: ")
+    _, _, several = text.partition("; NAME is the name of the policy's family: ")
     return several.split(", ") if several else re.findall(r"venv create (\w+)", text)
 
 

@@ -63,7 +63,7 @@ class ActionSpec:
     low: float | None = None  # lower bound of every number
     high: float | None = None  # upper bound of every number
     # Names of several arms, in the order of their commands in a row; each command is followed by
-    # that of the arm's gripper.
+    # the command of the arm's gripper.
     arms: tuple[str, ...] | None = None
     # Names of the joints in the order of a row, with or without the grippers.
     names: tuple[str, ...] | None = None
@@ -207,12 +207,13 @@ def differences(policy: Contract, env: Contract) -> list[str]:
 
     if policy.gripper and env.gripper is False:
         sentences.append(
-            "gripper: the policy needs Obs.gripper, which the env does not provide; fill it, 1 = "
+            "gripper: the policy needs Obs.gripper, which the env does not provide; set it, 1 = "
             "open"
         )
     if policy.instruction and env.instruction is False:
         sentences.append(
-            "instruction: the policy needs one, the env provides none; set it in the env's options"
+            "instruction: the policy needs an instruction, the env provides none; set it in the "
+            "env's options"
         )
 
     sentences += _action_differences(policy.action, env.action)
@@ -324,8 +325,8 @@ def _action_differences(policy: ActionSpec, env: ActionSpec) -> Iterator[str]:
 
     for number, ours, theirs in reordered(policy.names or (), env.names or ()):
         yield (
-            f"action.names: number {number} is {ours!r} of the policy and {theirs!r} of the env; "
-            "use one order"
+            f"action.names: number {number} is {ours!r} in the policy and {theirs!r} in the env; "
+            f"use the same order"
         )
 
     if policy.low is not None and env.low is not None and policy.low < env.low:

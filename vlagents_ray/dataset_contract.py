@@ -100,8 +100,8 @@ class DatasetContract:
             raise ConfigError(
                 "the contract of the dataset in the checkpoint cannot be read "
                 f"({type(error).__name__}: {error}); was the dataset written by a newer "
-                "vlagents-ray, or merged of datasets with different contracts? Update this one, or "
-                "export the results of `vlagents-ray merge`"
+                "vlagents-ray, or merged from datasets with different contracts? Update "
+                "vlagents-ray, or export the results of `vlagents-ray merge`"
             ) from error
         return contract
 

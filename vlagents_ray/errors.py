@@ -156,7 +156,7 @@ class MissingState(InvalidObservation):
 
 
 class NotOffered(InvalidObservation):
-    """The observation's `info["want"]` names a value that the policy's contract does not list
+    """The observation's `info["want"]` contains a name that the policy's contract does not list
     under `behaviour`.
     """
 

@@ -158,8 +158,8 @@ def _apply(document: dict[str, Any], override: Override) -> None:
         _insert(section, key, override.value, override)
     elif override.change == "add":
         raise override.error(
-            f"expected a new key, got one with the value {shown(section[key])}; change it without "
-            "the '+'"
+            f"expected a new key, got an existing key with the value {shown(section[key])}; leave "
+            f"out the '+' to change the value"
         )
     else:
         section[key] = override.value

@@ -268,7 +268,7 @@ def how_to_install(package: str, extra: str | None = None, distribution: str = C
         name, explanation = environments[0], ""
         if len(environments) > 1:
             name = "NAME"
-            explanation = f"; NAME is that of the policy's family: {', '.join(environments)}"
+            explanation = f"; NAME is the name of the policy's family: {', '.join(environments)}"
         return (
             f"run `vlagents-ray venv create {name}` and name the environment in the deployment's "
             f"`environment`{explanation}"
@@ -607,9 +607,10 @@ def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
     except ModuleNotFoundError as error:
         if error.name and (module == error.name or module.startswith(error.name + ".")):
             raise unknown(
-                f"{name!r}: no module {error.name!r} is installed, or lies in the working "
-                f"directory {Path.cwd()}; go to its folder, add that to PYTHONPATH, or install "
-                f"it{did_you_mean(error.name, (file.stem for file in Path.cwd().glob('*.py')))}"
+                f"{name!r}: no module {error.name!r} is installed, or is in the working directory "
+                f"{Path.cwd()}; go to the module's folder, add the folder to PYTHONPATH, or "
+                f"install the "
+                f"module{did_you_mean(error.name, (file.stem for file in Path.cwd().glob('*.py')))}"
             ) from error
         raise MissingDependency(f"{name!r} needs {error.name!r}, which is not installed") from error
     except VLAgentsError:
@@ -626,6 +627,6 @@ def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
         classes = [other for other, value in vars(loaded).items() if isinstance(value, type)]
         raise unknown(
             f"{name!r}: module {module!r} has no class {attribute!r}"
-            + (did_you_mean(attribute, classes) or "; write the name of a class that it has")
+            + (did_you_mean(attribute, classes) or "; write the name of a class in this module")
         )
     return target

@@ -55,7 +55,7 @@ class Slo:
         ):
             raise ConfigError(
                 f"slo.age_ms: expected {_LEAST:g} to {MOST:g} ms, got {shown(self.age_ms)}; leave "
-                "it out if actions of any age will do"
+                f"it out if actions may have any age"
             )
         if not (_is_number(self.share) and 0 < self.share <= 1):
             raise ConfigError(

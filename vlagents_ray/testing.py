@@ -248,7 +248,7 @@ def check_agent(
 
     # Run with prepared observations, also from several threads.
     if ability(agent, Prepares) is not None:
-        because = "`prepare` must compute what `act` computes without it"
+        because = "`act` must compute the same with and without `prepare`"
         for i, session in enumerate([suite.begin(i) for i in range(_SESSIONS)]):
             for step in range(steps):
                 where = f"act {step} of session {i} on a prepared observation"
@@ -256,7 +256,7 @@ def check_agent(
         _check_threads(suite, [acts[0] for acts in alone])
 
     # Run in batches.
-    because = "act_batch must give each session what act gives it alone"
+    because = "act_batch must return the action that act returns for the session alone"
     for size in range(1, _SESSIONS + 1):
         batch = [suite.begin(i) for i in range(size)]
         for step in range(steps):
@@ -286,8 +286,9 @@ def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:
     serial = [suite.prepare(i, session) for i, session in enumerate(sessions)]
     ended = threading.Event()
     cure = suite.cure = (
-        "a server calls `prepare` on several threads, also while others are reset and acted on: "
-        "change nothing in it that sessions share, such as a tokenizer's padding; compute tokens "
+        "a server calls `prepare` on several threads, also while it calls `reset` and `act` of "
+        "other sessions: do not change objects that sessions share, such as a tokenizer's padding; "
+        "compute tokens "
         "in `reset`, or hold a lock"
     )
 
@@ -521,8 +522,8 @@ def check_env(
     """
     if not isinstance(env, EvalEnv):
         raise ContractViolation(
-            f"env: expected an EvalEnv, got {env!r}; make one from Gymnasium's with "
-            "make_env('gymnasium/ID')"
+            f"env: expected an EvalEnv, got {env!r}; wrap an environment of Gymnasium with "
+            f"make_env('gymnasium/ID')"
         )
 
     contract = env.contract

@@ -123,7 +123,7 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
                 "action: expected finite numbers, got NaN or infinity; check the policy's output"
             )
         raise InvalidAction(
-            f"action: expected numbers of at most {LARGEST_ACTION:g}, got one of size "
+            f"action: expected numbers of at most {LARGEST_ACTION:g}, got a number of size "
             f"{largest:.3g}; check the policy's output"
         )
     if contract is not None and contract.action.dim not in (None, array.shape[-1]):

@@ -173,7 +173,7 @@ def test_a_file_is_found_by_its_name(row: Row, name: str) -> None:
 
 
 WRONG = {
-    "new, but it is there": ("+gain=2", "expected a new key, got one with the value 1"),
+    "new, but it is there": ("+gain=2", "expected a new key, got an existing key with the value 1"),
     "removed, but not there": ("~gian", "did you mean 'gain'?"),
     "an entry that is not there": ("entries.7.x=1", "0 to 0, got 7; append an entry"),
     "not a change": ("gain", "expected KEY=VALUE, +KEY=VALUE or ~KEY"),

@@ -183,7 +183,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "file absent": (["eval", "nope.yaml"], ["nope.yaml", "does not exist; "]),
     "file with options of suites": (
         ["eval", run(), "--episodes", "3"],
-        ["episodes", "write them in the file"],
+        ["episodes", "write these settings in the file"],
     ),
     "file empty": (["eval", " "], ["a mapping with", "policies", "got an empty file"]),
     "file a list": (["eval", "- 1"], ["list", "a mapping with"]),
@@ -333,9 +333,9 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "export: folder": (
         ["export", "done", "--out", "no/x.csv", "--to", "csv"],
-        ["no", "make it first"],
+        ["no", "create it first"],
     ),
-    "bundle: folder": (["bundle", "nowhere", "--out", "no/x.zip"], ["no/x.zip", "make it first"]),
+    "bundle: folder": (["bundle", "nowhere", "--out", "no/x.zip"], ["no/x.zip", "create it first"]),
     "export: a folder as the file": (
         ["export", "done", "--to", "csv", "--out", "."],
         ["expected a file", "folder"],

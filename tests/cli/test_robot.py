@@ -505,7 +505,7 @@ SIMULATED = "vlagents_ray.robot.simulated:SimulatedRobot"
         (
             None,
             [*SHORT, "--robot", "builtins:dict"],
-            "--robot builtins:dict: expected a class .*, got one without observe, apply, stop",
+            "--robot builtins:dict: expected a class .*, got a class without observe, apply, stop",
         ),
     ],
 )
@@ -817,7 +817,7 @@ ARM = ["--robot", SIMULATED]
             ["--teleop", "{here}:Unmade"],
             "--teleop .*expected a class that can be made without arguments, got TypeError",
         ),
-        (["--teleop", "builtins:dict"], "got one without engaged, action"),
+        (["--teleop", "builtins:dict"], "got a class without engaged, action"),
         (["--teleop", "broken_syntax:Leader"], "SyntaxError"),
         (["--measure", "elbow", *ARM, "--max-step", "1"], "elbow"),
         (

@@ -165,7 +165,7 @@ EVAL = ("--out", "runs/x", "--policy")
         ),
         (
             ("eval", "tabletop", "--policy", "scripted", "--resume"),
-            "Error: --resume: expected --out with it, the folder of the results to continue",
+            "Error: --resume: expected --out, the folder of the results to continue",
         ),
         (
             ("eval", "tabletop", "--out", "runs/x"),
@@ -248,9 +248,8 @@ def test_a_module_that_is_nowhere_is_looked_for_in_the_working_directory_which_i
     monkeypatch.chdir(folder)
     said = said_by("serve", "elsewhere:Policy")
     assert (
-        f"no module 'elsewhere' is installed, or lies in the working directory {folder}; go to "
-        "its "
-        "folder"
+        f"no module 'elsewhere' is installed, or is in the working directory {folder}; go to "
+        "the module's folder"
     ) in said
 
 

@@ -107,7 +107,7 @@ def test_the_nvidia_driver_that_sapien_names_by_itself_is_nobodys_wish(
 ) -> None:
     monkeypatch.setenv(GPUS, "")
     monkeypatch.setenv(graphics.VULKAN_DRIVERS[0], "/venv/sapien/vulkan_library/nvidia_icd.json")
-    with pytest.raises(ConfigError, match="given no GPU"):
+    with pytest.raises(ConfigError, match="no GPU is assigned to the worker"):
         require_own(graphics.vulkan_renderer("NVIDIA H200", None))
 
 
@@ -124,13 +124,13 @@ def test_where_no_device_fits_none_is_named(monkeypatch: pytest.MonkeyPatch) -> 
             "",
             LLVMPIPE,
             [NVIDIA, OTHERS],
-            r"given no GPU .* renders on 'NVIDIA H200.*worker: \{gpus: 0.25\}",
+            r"no GPU is assigned .* renders on 'NVIDIA H200.*worker: \{gpus: 0.25\}",
         ),
         (
             "3",
             NVIDIA,
             [LLVMPIPE, OTHERS],
-            r"given the GPU 3, but its env renders on .*libnvidia-gl",
+            r"the GPU 3 is assigned to the worker, but its env renders on .*libnvidia-gl",
         ),
     ],
 )

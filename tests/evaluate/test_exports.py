@@ -50,7 +50,7 @@ def test_a_table_is_a_file_in_a_folder_that_exists(
 ) -> None:
     with pytest.raises(ConfigError, match="expected a file, got a folder"):
         write(results, tmp_path)
-    with pytest.raises(ConfigError, match="expected a file in a folder that exists"):
+    with pytest.raises(ConfigError, match="expected a file in an existing folder"):
         write(results, tmp_path / "missing" / "a.csv")
 
 

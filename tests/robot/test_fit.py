@@ -124,7 +124,9 @@ def test_a_chunk_is_drawn_without_training_and_limits() -> None:
 def test_joints_in_another_order_than_that_of_the_limits_are_found_by_name() -> None:
     limits = MotionLimits(joints=("lift.pos", "pan.pos", "gripper.pos"))
     first, second = Trained().misfits(None, None, limits, NAMES)
-    assert first == "joints: number 0 is 'pan' of the arm and 'lift' of its limits; use one order"
+    assert (
+        first == "joints: number 0 is 'pan' in the arm and 'lift' in its limits; use the same order"
+    )
     assert "number 1 is 'lift'" in second
     assert Trained().misfits(None, None, MotionLimits(joints=("pan.pos", "lift.pos")), NAMES) == []
     assert Trained().misfits(None, None, MotionLimits(joints=("joint1", "joint2")), NAMES) == [], (
@@ -135,7 +137,7 @@ def test_joints_in_another_order_than_that_of_the_limits_are_found_by_name() -> 
 def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name() -> None:
     policy = Contract(action=ActionSpec(dim=3, names=("lift.pos", "pan.pos", "gripper.pos")))
     with pytest.raises(
-        ContractMismatch, match="number 0 is 'lift' of the policy and 'pan' of the env"
+        ContractMismatch, match="number 0 is 'lift' in the policy and 'pan' in the env"
     ) as caught:
         require_match(policy, contract_of(Standing(0, 0)))
     assert str(caught.value).count("- action.names: number") == 2

@@ -259,7 +259,7 @@ def test_the_loop_has_no_other_guard_than_its_player() -> None:
     assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.02, 0.02]
     assert report.safe_ticks == 3
     run_loop(robot, player, hz=HZ, seconds=0.05, options=LoopOptions(guard=guard))
-    with pytest.raises(ConfigError, match="got both; leave one out"):
+    with pytest.raises(ConfigError, match="got both; leave out one of these"):
         run_loop(robot, player, hz=HZ, options=LoopOptions(guard=Guard(high=0.025)))
     player.close()
 

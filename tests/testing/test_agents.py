@@ -257,7 +257,7 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     (with_batch(lambda acts, _: acts[::-1]), "session 0 in a batch of 2"),
     (with_batch(lambda acts, _: acts[:2]), "expected a list of 3 Acts, got 2 of them"),
     (with_batch(lambda _, obs: [RuntimeError("out of memory") for _ in obs]), "out of memory"),
-    (ActsByItself, "act_batch must give each session"),
+    (ActsByItself, "act_batch must return the action"),
     (with_batch(lambda acts, _: tuple(acts)), "got tuple"),
     (with_act(lambda act, _: act.action), "act: expected an Act, got ndarray"),
     (with_act(lambda act, _: replace(act, action=act.action.astype(np.float64))), "float64"),
@@ -272,7 +272,10 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
         "expected done to be a bool, got bool",
     ),
     (with_act(lambda act, _: replace(act, info={"t": np.float32(1)})), r"info\['t'\]"),
-    (PreparesOtherwise, "on a prepared observation.*`prepare` must compute what"),
+    (
+        PreparesOtherwise,
+        "on a prepared observation.*`act` must compute the same with and without `prepare`",
+    ),
     (SharesItsTokenizer, r"prepare of session . on a thread.*\['tokens'\].*a tokenizer's padding"),
     (
         CountsTokensWithIt,

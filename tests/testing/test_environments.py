@@ -264,7 +264,7 @@ def test_an_object_that_is_no_env_of_ours_is_refused() -> None:
     with pytest.raises(
         ContractViolation,
         match=(
-            r"expected an EvalEnv, got .*; make one from Gymnasium's with "
+            r"expected an EvalEnv, got .*; wrap an environment of Gymnasium with "
             r"make_env\('gymnasium/ID'\)"
         ),
     ):

@@ -469,8 +469,8 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
         excess = [*targets[1:], *policy, *suite]
         if excess:
             raise ConfigError(
-                f"expected only {target} to define the evaluation, got {excess} with it; "
-                "write them in the file, or change it with --set"
+                f"expected only {target} to define the evaluation, got {excess} as well; write "
+                f"these settings in the file, or change the file with --set"
             )
         document = read_run(Path(target), overrides)
         fields = _with_files_found(document, options.config_dir) | run
@@ -503,8 +503,7 @@ def _new_folder(env: str, *, resume: bool) -> Path:
     """
     if resume:
         raise ConfigError(
-            "--resume: expected --out with it, the folder of the results to continue, got none; "
-            "add it"
+            "--resume: expected --out, the folder of the results to continue, got none; add it"
         )
     return fresh(Path("runs") / f"{plain(env)}-{time.strftime('%Y%m%d-%H%M%S')}")
 

@@ -74,7 +74,8 @@ def environment(name: Name) -> None:
     """
     with errors():
         _write(name, "env")
-        _print_steps((f"{as_typed('vlagents-ray')} eval {name}.yaml", "runs ten episodes in it"))
+        command = f"{as_typed('vlagents-ray')} eval {name}.yaml"
+        _print_steps((command, "runs ten episodes in the environment"))
 
 
 @init.command()

@@ -171,7 +171,7 @@ def _existing(file: Path | None) -> Path:
     path = _path(file)
     if not path.is_file():
         raise ConfigError(
-            f"keys file {path} does not exist; `vlagents-ray keys create NAME --keys {path}` makes "
-            "it"
+            f"keys file {path} does not exist; `vlagents-ray keys create NAME --keys {path}` "
+            f"creates it"
         )
     return path

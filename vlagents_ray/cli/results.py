@@ -73,8 +73,8 @@ def report_command(
 
             if len(folders) != 1 or path is not None or as_json:
                 raise ConfigError(
-                    "--live: expected one FOLDER, no --out and no --json, got others; leave them "
-                    "out, as --live shows one folder and writes nothing"
+                    "--live: expected one FOLDER, no --out and no --json, got more arguments; "
+                    "leave them out, as --live shows one folder and writes nothing"
                 )
             follow(folders[0], live_address(live_at))
             return

@@ -288,7 +288,10 @@ def _watched(
         if has_terminal:
             say(KEYS)
         else:
-            say("no keys, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it")
+            say(
+                "no keys, as there is no terminal; SIGTERM ends the run, and SIGUSR1 restarts "
+                "motion after a stop"
+            )
         yield watchdog
 
 
@@ -796,8 +799,8 @@ def _add_chunk_options(options: _Options) -> None:
     options.both(
         "--mode",
         **one_of(*get_args(Mode)),
-        help="When the next chunk is requested, and how it is executed, see docs/control_loop.md; "
-        "default: async, with --env open_loop.",
+        help="Mode that determines when the next chunk is requested and how chunks are executed, "
+        "see docs/control_loop.md; default: async, with --env open_loop.",
     )
     options.both(
         "--execute",
@@ -871,7 +874,7 @@ def _add_safety_options(options: _Options) -> None:
         "--measure",
         metavar="PART",
         help="Part of the state with the measured pose, such as joints. The first action is "
-        "compared with it.",
+        "compared with this pose.",
     )
     options.robot(
         "--stats",
@@ -882,8 +885,8 @@ def _add_safety_options(options: _Options) -> None:
     options.robot(
         "--ignore-mismatch",
         action="store_true",
-        help="Move even if the pose or the first chunk does not fit the statistics. The log "
-        "records it.",
+        help="Move even if the pose or the first chunk does not fit the statistics, and log the "
+        "misfits.",
     )
     options.robot(
         "--silent-s",
@@ -923,7 +926,7 @@ def _add_server_options(options: _Options) -> None:
         type=seconds,
         metavar="MS",
         help="Largest useful age of an executed action, in ms. Before the first motion, the server "
-        "reports whether it can serve the robot within it.",
+        "reports whether it can keep this limit.",
     )
     options.robot(
         "--slo-share",

@@ -46,8 +46,8 @@ class Credentials:
         key = os.environ.get(KEY_VARIABLE) if self.api_key is None else self.api_key
         if key is not None and not (key.isascii() and key.isprintable() and " " not in key):
             raise ConfigError(
-                "api_key: expected visible ASCII characters without spaces, got others; give it "
-                "as `keys create` printed it"
+                "api_key: expected visible ASCII characters without spaces, got other characters; "
+                "pass the key exactly as `keys create` printed it"
             )
         object.__setattr__(self, "api_key", key or None)
 

@@ -109,7 +109,8 @@ class ClientSession:
         """Return the request for an action; raises `NotReset` if no episode has begun."""
         if self.episode is None:
             raise NotReset(
-                "expected a reset before act: this agent has no session, or lost it; reset it"
+                "expected a reset before act: this agent has no session, or has lost its session; "
+                "call reset"
             )
         return Request(
             "act",

@@ -167,8 +167,8 @@ class Trained:
         sentences = []
         for number, ours, theirs in reordered(names, joints):
             sentences.append(
-                f"joints: number {number} is {ours!r} of the arm and {theirs!r} of its limits; use "
-                "one order"
+                f"joints: number {number} is {ours!r} in the arm and {theirs!r} in its limits; use "
+                f"the same order"
             )
 
         names = [name.removesuffix(".pos") for name in names or joints]
@@ -221,7 +221,7 @@ class Trained:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The numbers of a policy compared with those of an arm, before the first motion (see
+    """Compares the numbers of a policy with the numbers of an arm, before the first motion (see
     `loop.fit_of`).
     """
 

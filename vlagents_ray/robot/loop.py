@@ -210,8 +210,8 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
         imported = importlib.import_module(module)
     except (ImportError, ValueError) as error:
         raise ConfigError(
-            f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this "
-            "one), add that to PYTHONPATH, or install it"
+            f"{option} {name}: {error}; go to the folder of its module (the present folder is "
+            f"{os.getcwd()}), add the folder to PYTHONPATH, or install the module"
         ) from error
     except Exception as error:  # the module may raise any error, including a SyntaxError
         raise ConfigError(
@@ -221,7 +221,7 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
     cls = getattr(imported, attribute, None)
     if cls is None:
         public_names = [key for key in vars(imported) if not key.startswith("_")]
-        hint = did_you_mean(attribute, public_names) or "; write the name of a class in it"
+        hint = did_you_mean(attribute, public_names) or "; write the name of a class in this module"
         raise ConfigError(f"{option} {name}: module {module!r} has no {attribute!r}{hint}")
     return _with_methods(f"{option} {name}", cls, methods)
 
@@ -235,8 +235,8 @@ def _with_methods(where: str, cls: Any, methods: Sequence[str]) -> Any:
     missing = [method for method in methods if not callable(getattr(cls, method, None))]
     if missing:
         raise ConfigError(
-            f"{where}: expected a class with {', '.join(methods)}, got one without "
-            f"{', '.join(missing)}; add them"
+            f"{where}: expected a class with {', '.join(methods)}, got a class without "
+            f"{', '.join(missing)}; add these methods"
         )
     return cls
 
@@ -403,7 +403,8 @@ class LoopReport:
                 cause, most_ticks = safe_cause, safe_ticks
         return (
             f"the policy hardly drove the robot: {self.safe_ticks} of {ticks} ticks had no action "
-            f"of the policy, most often: {self.reasons.get(cause, cause)}. {_cure(cause)}"
+            f"of the policy, most often for this reason: {self.reasons.get(cause, cause)}. "
+            f"{_cure(cause)}"
         )
 
     @property
@@ -664,7 +665,8 @@ def _guard_of(agent: Agent, guard: Guard | None, hz: float) -> Guard:
         agent_guard = has_check.check
     if guard is not None and agent_guard is not None and agent_guard is not guard:
         raise ConfigError(
-            "guard: expected either `guard` or the agent's own check=, got both; leave one out"
+            "guard: expected either `guard` or the agent's own check=, got both; leave out one of "
+            "these"
         )
 
     guard = guard or agent_guard or Guard(agent.contract)

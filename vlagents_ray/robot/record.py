@@ -121,8 +121,8 @@ class Recorder:
             raise ConfigError(f"label: expected one of {list(get_args(Label))}, got {label!r}")
         if label != "discard" and not self.interventions:
             raise ConfigError(
-                f"label: expected a dataset with labels, got {label!r} for one without; give "
-                "interventions=True"
+                f"label: expected a dataset with labels for {label!r}, got a dataset without "
+                f"labels; pass interventions=True"
             )
         self._label = label
 

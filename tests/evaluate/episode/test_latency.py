@@ -118,7 +118,7 @@ def test_what_a_clock_lacks_is_named() -> None:
     ):
         played(ChunkExecutor(None, clock(neutral=[0, 0, 0]), ABSOLUTE), 0.1)
     for execute in (None, 7):
-        with pytest.raises(ConfigError, match="none is left to continue"):
+        with pytest.raises(ConfigError, match="all of which are executed before the next request"):
             played(ChunkExecutor(execute, clock(real_time_chunking=True), RELATIVE), 0.1)
     bare = Contract(action=RELATIVE.action)
     with pytest.raises(ConfigError, match=r"give clock\.hz"):

@@ -73,7 +73,7 @@ def test_a_scene_is_set_played_and_judged(
             page.value(CLICK.format("repeat"))
             until(
                 page,
-                "document.getElementById('error').textContent.includes('expected a reason in words')",
+                "document.getElementById('error').textContent.includes('expected a reason for the repetition')",
                 want=True,
             )
             if number < 3:

@@ -189,7 +189,7 @@ def test_a_task_without_a_rubric_knows_no_partial_success() -> None:
         Verdict("partial", ("lid",)).score({})
     with pytest.raises(ConfigError, match=r"got the parts \['lid'\]"):
         Verdict("partial", ("lid",)).score({"cup": 1})
-    with pytest.raises(ConfigError, match="expected a reason in words"):
+    with pytest.raises(ConfigError, match="expected a reason for the repetition"):
         Verdict("repeat").score({})
 
 
@@ -202,7 +202,7 @@ def test_a_repeated_trial_is_counted_with_its_reason_and_played_by_the_same_poli
     summary = evaluate_on_robot(config, person, agent_factory=policies)
     order = names_by_trial(config)
     assert policies.made[2:] == [order[0], *order]
-    assert any("expected a reason in words" in line for line in person.printed)
+    assert any("expected a reason for the repetition" in line for line in person.printed)
     assert any("repeated: somebody walked into the scene" in line for line in person.printed)
     [attempt] = [attempt for case in summary.results.cases for attempt in case.attempts]
     assert (attempt.cause, attempt.error, attempt.retried) == (

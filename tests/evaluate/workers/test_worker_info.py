@@ -55,6 +55,7 @@ def test_a_worker_that_was_given_a_gpu_and_draws_elsewhere_stops_the_evaluation(
 ) -> None:
     settings = config(envs=[DRAWN], episodes=2, workers=1, gpus_per_worker=0.5)
     with pytest.raises(
-        ConfigError, match=r"given the GPU 0, but its env renders on 'llvmpipe.*libnvidia-gl"
+        ConfigError,
+        match=r"the GPU 0 is assigned to the worker, but its env renders on 'llvmpipe.*libnvidia-gl",
     ):
         evaluate(settings, agent_factory=ToZero)

@@ -139,7 +139,7 @@ class UnixTransport(ABC):
     def _await(
         self, connection: socket.socket, requests: Sequence[Request], deadline: float
     ) -> list[Reply]:
-        """Return the replies to these requests, skipping those to earlier ones."""
+        """Return the replies to these requests, and discard the replies to earlier requests."""
         begun = time.perf_counter()
         spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
         while True:
@@ -177,7 +177,7 @@ class UnixTransport(ABC):
         return self._socket
 
     def _ping(self) -> None:
-        """Ping the server, unless the socket is full of messages that it has not read."""
+        """Ping the server, unless the socket is full of messages that the server has not read."""
         if self._socket is not None:
             with contextlib.suppress(OSError):  # the next read raises the error
                 self._socket.send(LocalAddress.PING)

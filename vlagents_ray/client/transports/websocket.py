@@ -348,7 +348,7 @@ class Stream:
         self._flush(deadline)
 
     def _ping(self) -> None:
-        """Ping the server, unless the socket is full of bytes that it has not read."""
+        """Ping the server, unless the socket is full of bytes that the server has not read."""
         self._protocol.send_ping(b"")
         for piece in self._protocol.data_to_send():
             with contextlib.suppress(BlockingIOError):

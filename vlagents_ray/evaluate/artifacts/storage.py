@@ -120,8 +120,8 @@ def require_folder_of(file: Path) -> None:
         raise ConfigError(f"{file}: expected a file, got a folder; add the name of a file")
     if not file.absolute().parent.is_dir():
         raise ConfigError(
-            f"{file}: expected a file in a folder that exists, got no folder {file.parent}; make "
-            "it first"
+            f"{file}: expected a file in an existing folder, got the missing folder {file.parent}; "
+            f"create it first"
         )
 
 

@@ -72,7 +72,7 @@ class ChunkExecutor:
             raise ConfigError(
                 "clock: expected clock.neutral, the action before the first answer, or an env "
                 "whose contract declares relative actions, got neither; give clock.neutral, as "
-                "zeros might be a pose to move to"
+                "zeros might command a motion to a pose"
             )
 
         self._plan = ChunkBuffer()

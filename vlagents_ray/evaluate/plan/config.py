@@ -99,7 +99,7 @@ class PolicyConfig(_PlanModel):
     )
     config: dict[str, JsonValue] = Field(
         default={},
-        description="Settings of the policy, which override those of a deployment file.",
+        description="Settings of the policy, which override the settings of a deployment file.",
     )
     options: dict[str, JsonValue] = Field(
         default={},
@@ -163,7 +163,7 @@ class PolicyConfig(_PlanModel):
     def _consistent(self) -> Self:
         if self.steps and self.pushed_weights is not None:
             raise ValueError(
-                "expected steps or pushed_weights, got both; leave one out, as each names "
+                "expected steps or pushed_weights, got both; leave out one of these, as each names "
                 "checkpoints in the results"
             )
 
@@ -278,8 +278,8 @@ class StopConfig(_PlanModel):
     def _some_end(self) -> Self:
         if self.target is None and self.width is None:
             raise ValueError(
-                "expected a target, a width or both, got neither; give at least one, as the "
-                "first that is reached ends the task"
+                "expected a target, a width or both, got neither; give at least one of these, as "
+                "the first one that is reached ends the case"
             )
         return self
 
@@ -289,7 +289,7 @@ class SuiteConfig(_PlanModel):
 
     name: str = Field(
         default="",
-        description="The name in the results. An environment may be in two suites of different "
+        description="The name in the results. An environment may be in two suites with different "
         "names and settings.",
     )
     envs: list[Name] = Field(
@@ -448,8 +448,8 @@ class RobotConfig(_PlanModel):
     )
     ignore_mismatch: bool = Field(
         default=False,
-        description="Move even if the statistics of the training do not fit the arm. The log "
-        "records it.",
+        description="Move even if the statistics of the training data do not fit the arm, and log "
+        "the misfits.",
     )
     silent_s: Seconds = Field(
         default=2.0,

@@ -243,8 +243,9 @@ def lock(out: Path) -> int:
             if error.errno not in _NO_LOCKS:
                 raise
             raise ConfigError(
-                f"{out}: expected a file system with locks, got one without ({error.strerror}), "
-                "where two evaluations could write to one folder; choose another folder with "
+                f"{out}: expected a file system with locks, got a file system without locks "
+                f"({error.strerror}), on which two evaluations could write to one folder; choose "
+                f"another folder with "
                 "--out (Lustre: have it mounted with `-o flock`)"
             ) from error
         return file

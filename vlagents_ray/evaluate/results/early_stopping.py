@@ -63,7 +63,7 @@ class CaseStopping:
         self._episodes_per_seed = planned // len(seeds)
         self._outcomes: dict[int, bool] = {}  # outcomes by index in the plan
         self._in_order = 0  # the number of episodes in the unbroken prefix of the plan
-        self._successes = 0  # the number of successes in that prefix
+        self._successes = 0  # the number of successes in the unbroken prefix
         # The number of episodes after which the case stops; None: not decided yet.
         self.at: int | None = None
 

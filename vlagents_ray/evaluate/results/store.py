@@ -337,7 +337,9 @@ class Store(AbstractContextManager["Store"]):
                 described, contract = row
                 was = EnvStatement(json.loads(described), json.loads(contract))
                 changes |= dict.fromkeys(env_changes(env, was, now))
-        self._accept_or_raise(place, list(changes), "the environment is not that of the results in")
+        self._accept_or_raise(
+            place, list(changes), "the environment differs from the environment of the results in"
+        )
 
     def note_policy(self, name: str, metadata: dict[str, Any]) -> None:
         """Record the metadata of a policy's server.
@@ -358,7 +360,7 @@ class Store(AbstractContextManager["Store"]):
                 )
             changes = policy_changes(f"policy {name}", earlier, metadata, swept=swept)
             self._accept_or_raise(
-                ("policy", name), changes, "the policy is not that of the results in"
+                ("policy", name), changes, "the policy differs from the policy of the results in"
             )
 
         self._policy_programs[name] = program_id(policy_program(metadata, swept=swept))
@@ -446,12 +448,14 @@ class Store(AbstractContextManager["Store"]):
         self._accept_or_raise(
             "plan",
             self._other_plan(db),
-            "this plan is not that of the results in",
+            "this plan differs from the plan of the results in",
             "plan all of it; choose a new folder (--out); or continue with this plan, which the "
             "report will mention (--accept-changes)",
         )
         self._accept_or_raise(
-            "program", self._other_programs(db), "the environment is not that of the results in"
+            "program",
+            self._other_programs(db),
+            "the environment differs from the environment of the results in",
         )
 
     def _stopping_rule(self) -> str | None:

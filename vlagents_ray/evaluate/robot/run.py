@@ -165,8 +165,8 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
 
         if not hmac.compare_digest(lines[0]["plan"], identity):
             raise ConfigError(
-                f"{self._path}: expected a log of this plan, robot and key, got another's; use "
-                "those, or choose another out folder"
+                f"{self._path}: expected a log of this plan, robot and key, got the log of another "
+                f"plan, robot or key; use the same ones, or choose another out folder"
             )
         self.started = float(lines[0]["at"])
         unfinished_attempts: set[tuple[int, int]] = set()
@@ -422,7 +422,9 @@ def require_trials(config: EvalConfig) -> None:
             "got no robot; give both"
         )
     if any(policy.pushed_weights is not None for policy in config.policies):
-        raise ConfigError("pushed_weights: expected none with a robot, got some; leave them out")
+        raise ConfigError(
+            "pushed_weights: expected none with a robot, got some; leave out this setting"
+        )
     if config.track:
         raise ConfigError(
             f"track: expected none with a robot, got {config.track}; leave it out, as rates would "

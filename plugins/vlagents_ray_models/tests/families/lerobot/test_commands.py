@@ -377,4 +377,4 @@ def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name() -> 
     )
     trained = replace(CONTRACT, action=replace(CONTRACT.action, names=("a", "b", "gripper")))
     [first, _] = [line for line in differences(trained, here) if "action.names" in line]
-    assert "number 0 is 'a' of the policy and 'b' of the env" in first
+    assert "number 0 is 'a' in the policy and 'b' in the env" in first
