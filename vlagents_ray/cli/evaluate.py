@@ -326,7 +326,8 @@ class EvalOptions:
         watch_options = self.options_set("until", "settle_s", "marker")
         if self.watch is None and watch_options:
             raise ConfigError(
-                f"expected --watch with {watch_options}, got none; add it, or leave them out"
+                f"expected --watch with {watch_options}, got none; add --watch, or leave the "
+                f"others out"
             )
         if self.dry_run and self.watch is not None:
             raise ConfigError(
@@ -349,7 +350,8 @@ class EvalOptions:
         robot_options = self.options_set("operator", "unblind")
         if not on_robot and robot_options:
             raise ConfigError(
-                f"expected --robot with {robot_options}, got none; add it, or leave them out"
+                f"expected --robot with {robot_options}, got none; add --robot, or leave the "
+                f"others out"
             )
         excluded = self.options_set("watch", "dry_run", "end_at", "track", "live", "live_at")
         if on_robot and excluded:

@@ -117,7 +117,7 @@ def plugin(name: Name, context: typer.Context) -> None:
         _print_steps(
             (f"cd {name}", "the folder of the plug-in"),
             (f"{python} -m pip install --editable .", "registers the plug-in in this environment"),
-            (f"{python} test_{name}.py", "checks it; so does pytest"),
+            (f"{python} test_{name}.py", "runs the test; pytest does the same"),
             (f"{command} serve {name}.yaml", "serves it"),
         )
 
@@ -185,7 +185,8 @@ def _write(name: str, kind: Kind) -> None:
 
     out.print(f"wrote {', '.join(map(str, texts))}. Next:")
     if kind != "plugin":
-        _print_steps((f"{as_typed('python')} test_{name}.py", "checks it; so does pytest"))
+        command = f"{as_typed('python')} test_{name}.py"
+        _print_steps((command, "runs the test; pytest does the same"))
 
 
 def as_typed(program: str) -> str:

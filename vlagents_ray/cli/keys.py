@@ -69,8 +69,8 @@ def create(
         str | None,
         typer.Option(
             metavar="robot|simulation",
-            help="Highest priority of its requests. Robots are served before simulations; default: "
-            "robot.",
+            help="Highest priority of the key's requests. Robots are served before simulations; "
+            "default: robot.",
         ),
     ] = None,
     scope: Annotated[

@@ -192,8 +192,8 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
         return f"not in this environment ({', '.join(modules)}): {cure}"
 
     cure = (
-        f"`vlagents-ray venv create {requirements}`, and that Python in `environment` of its "
-        "deployment"
+        f"`vlagents-ray venv create {requirements}`, and the Python of this environment as "
+        f"`environment` in the deployment"
     )
     if sources:
         cure += f"; {' or '.join(sources)}=FOLDER of a checkout"

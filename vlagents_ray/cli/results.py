@@ -41,7 +41,7 @@ def report_command(
     ] = None,
     inline: Annotated[
         bool,
-        typer.Option("--inline", help="Include the videos in the page, up to a limit of its size."),
+        typer.Option("--inline", help="Embed the videos in the page, up to a maximum size."),
     ] = False,
     accept_changes: Annotated[
         bool,

@@ -227,7 +227,8 @@ class Connection:
             return
         raise ReplicaSilent(
             f"{self.url}: the replica has not answered a ping for {silent_s:.1f} s, while another "
-            "one answers; its process is frozen, or holds the interpreter's lock"
+            f"replica answers; the process of the silent replica is frozen, or holds the "
+            f"interpreter lock"
         )
 
     def _drop_next(self) -> None:

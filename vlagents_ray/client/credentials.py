@@ -81,7 +81,8 @@ class Credentials:
         except OSError as error:  # includes ssl.SSLError, a subclass
             raise ConfigError(
                 f"TLS: ca={self.ca!r}: expected a file with the certificate of the CA that signed "
-                f"the server's, in PEM (it begins with -----BEGIN CERTIFICATE-----), got {error}"
+                f"the server's certificate, in PEM (the file begins with -----BEGIN "
+                f"CERTIFICATE-----), got {error}"
             ) from error
 
         try:

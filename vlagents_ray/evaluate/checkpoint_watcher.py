@@ -57,8 +57,8 @@ class CheckpointWatcher:
         step_index = next((i for i, name in enumerate(names) if STEP in name), None)
         if step_index is None:
             raise ConfigError(
-                f"checkpoint {pattern!r}: expected {STEP} in it, got none; write it in place of "
-                "the step"
+                f"checkpoint {pattern!r}: expected {STEP} in the pattern, got none; write it in "
+                f"place of the step's number"
             )
 
         self.folder = Path(*names[:step_index]) if folder is None else folder

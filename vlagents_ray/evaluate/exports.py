@@ -80,7 +80,7 @@ COLUMNS = (
     Column(
         "episode",
         "integer",
-        "its number, from 0",
+        "number of the episode, from 0",
         lambda _case, episode: episode.result.key.episode,
     ),
     Column(
@@ -104,12 +104,12 @@ COLUMNS = (
     Column(
         "counted",
         "boolean",
-        "whether the rates include it",
+        "whether the rates include the episode",
         lambda _case, episode: episode.counts,
     ),
     _of_result("success_once", "boolean", "the task was solved after some step"),
     _of_result("success_at_end", "boolean", "the task was solved after the last step"),
-    _of_result("first_success", "integer", "steps after which it was solved for the first time"),
+    _of_result("first_success", "integer", "steps after which the task was first solved"),
     _of_result("steps", "integer", "actions executed"),
     _of_result("return", "number", "sum of the rewards", "episode_return"),
     _of_result("ending", "string", "terminated, truncated, policy_done or error"),
@@ -168,12 +168,12 @@ COLUMNS = (
     _of_episode(
         "env_program",
         "string",
-        "digest of the env's files, including its code; null if installed",
+        "digest of the env's files, including its code; null for an installed env",
     ),
     _of_episode(
         "policy_program",
         "string",
-        "digest of the policy's files, including its code; null if installed",
+        "digest of the policy's files, including its code; null for an installed policy",
     ),
     _of_result(
         "ticks",

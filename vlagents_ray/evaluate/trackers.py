@@ -77,7 +77,7 @@ class TrackerFeed:
         """Prepare the trackers of a plan."""
         self._plan = plan
         self._working = list(plan.trackers)  # the trackers that have not failed
-        self._runs: dict[tuple[str, str], TrackerRun] = {}  # by tracker and policy
+        self._runs: dict[tuple[str, str], TrackerRun] = {}  # keys: (tracker, policy)
         self._updated = threading.Event()
         self._closing = False
         self._thread = threading.Thread(

@@ -156,7 +156,7 @@ def _no_prompts(task: str) -> Iterator[None]:
             yield
     except SystemExit as error:
         lines = [line for line in output.getvalue().splitlines() if "found" in line]
-        prompt = lines[0] if lines else "it did not say which"
+        prompt = lines[0] if lines else "ManiSkill does not name them"
         robot = re.match(r"Robot (\S+) ", prompt)
         raise EnvFailed(
             f"maniskill/{task}: assets are missing ({prompt.partition(' Would you')[0]}); download "

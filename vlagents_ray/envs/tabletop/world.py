@@ -262,7 +262,7 @@ TEMPLATES: dict[Task, str] = {
 }
 COLOURS = ("red", "green", "blue", "yellow", "purple")
 
-PUCKS = 4  # at most
+PUCKS = 4  # largest number of pucks
 _PADS = 3
 _AREA = (0.22, 0.13)  # m, half extents of the area in which objects are placed
 _CLEARANCE = 0.09  # m between the centres of two pucks: room for both pucks and an open finger

@@ -30,7 +30,8 @@ Cause = Literal["user", "policy", "worker", "operator"]
 # line of the policy.
 _CURES: dict[type[errors.VLAgentsError], str] = {
     errors.ConnectionLost: (
-        "; or run the policy in this process with --workers 0, to find the line that ends it"
+        "; or run the policy in this process with --workers 0, to find the line that ends the "
+        "server"
     ),
     errors.DeadlineExceeded: (
         "; in an evaluation, timeout_s is policy_timeout_s; or run the policy in this process with "

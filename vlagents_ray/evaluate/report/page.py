@@ -269,7 +269,7 @@ class Latency:
 
 def latency(summary: Summary) -> Latency | None:
     """Return the latencies; None if no episode was run."""
-    counted: dict[str, list[EpisodeResult]] = {}  # by policy id
+    counted: dict[str, list[EpisodeResult]] = {}  # keys: policy ids
     for name in summary.results.policy_ids:
         results = summary.results.only(name).counted
         if results:
@@ -372,7 +372,7 @@ def protocol(results: Results) -> list[Env]:
 
 def configuration(results: Results) -> Configuration:
     """Return the software and the machines that produced the results."""
-    programs: dict[str, Mapping[str, str]] = {}  # by env
+    programs: dict[str, Mapping[str, str]] = {}  # keys: envs
     checkpoints: dict[tuple[str, str], None] = {}
     for case in results.cases:
         if case.program:

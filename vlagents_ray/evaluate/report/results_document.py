@@ -173,7 +173,7 @@ def _case(case: CaseResults) -> dict[str, Any]:
 
 def _curves(results: Results) -> list[dict[str, Any]]:
     """Return the success rate at each step or version, for each policy that has steps."""
-    points: dict[str, list[dict[str, Any]]] = {}  # by policy
+    points: dict[str, list[dict[str, Any]]] = {}  # keys: policies
     for policy_id in results.policy_ids:
         cases = results.of(policy_id)
         policy, step = cases[0].policy, cases[0].step

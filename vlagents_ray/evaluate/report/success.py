@@ -319,7 +319,7 @@ def _main_pairs(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tupl
     """Return the main pairs among `pairs`: each checkpoint with the previous checkpoint, and the
     best policy id with the best policy id of each other policy.
     """
-    policies: dict[str, str] = {}  # by policy id
+    policies: dict[str, str] = {}  # keys: policy ids
     steps: dict[str, int | None] = {}
     for case in summary.results.cases:
         policies[case.policy_id] = case.policy

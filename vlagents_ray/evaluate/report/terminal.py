@@ -351,7 +351,7 @@ def _losses(summary: Summary) -> list[str]:
 
 
 def _pushed_weights(summary: Summary) -> list[str]:
-    weights: dict[str, str] = {}  # by policy id
+    weights: dict[str, str] = {}  # keys: policy ids
     for case in summary.results.cases:
         versions = pushed_of(case)
         if versions is not None:

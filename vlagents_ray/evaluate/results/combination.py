@@ -120,7 +120,7 @@ def _clashing_policies(folders: Sequence[Results]) -> set[str]:
         case.policy for case in all_cases if counts[case.policy_id, case.suite, case.env] > 1
     }
 
-    known_weights: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
+    known_weights: dict[tuple[str, str | None], str] = {}  # keys: (policy id, checkpoint)
     for case in all_cases:
         weights, checkpoint = reported(case, "weights"), reported(case, "checkpoint")
         if weights is None:

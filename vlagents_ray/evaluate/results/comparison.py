@@ -44,7 +44,7 @@ OF_POLICY = frozenset(
 )
 ALL = "all"
 
-Strata = dict[str, Pairs]  # by env
+Strata = dict[str, Pairs]  # keys: envs
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Line:
     """The comparison of two policies on one suite, or on all suites together."""
 
     suite: str  # name of the suite, or "all"
-    strata: tuple[Pairs, ...]  # by env
+    strata: tuple[Pairs, ...]  # one item for each env
     # McNemar's p-value, adjusted with Holm's method for all comparisons of its family.
     adjusted: float
 
@@ -236,7 +236,7 @@ def clock_gaps(results: Results) -> list[Comparison]:
     The name of A is "POLICY_ID, SUITE in real time", and the name of B is "POLICY_ID, SUITE". A
     suite without a counterpart is left out.
     """
-    strata: dict[tuple[str, str], Strata] = {}  # by the names of A and B
+    strata: dict[tuple[str, str], Strata] = {}  # keys: (name of A, name of B)
     cases: dict[tuple[str, str], list[CaseResults]] = {}
     order = {name: number for number, name in enumerate(results.policy_ids)}
     for case in sorted(results.cases, key=lambda case: order[case.policy_id]):

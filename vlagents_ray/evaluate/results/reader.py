@@ -210,11 +210,11 @@ class Results:
         out = Path(out)
         was_locked = is_locked(out)
         with reading(out) as db:
-            episodes: dict[str, list[Episode]] = {}  # by case
+            episodes: dict[str, list[Episode]] = {}  # keys: cases
             for row in table(db, "episodes", "seed"):
                 episodes.setdefault(row["case_id"], []).append(episode_of(row))
 
-            attempts: dict[str, list[Attempt]] = {}  # by case
+            attempts: dict[str, list[Attempt]] = {}  # keys: cases
             for row in table(db, "attempts"):
                 attempt = Attempt(**row | {"retried": bool(row["retried"])})
                 attempts.setdefault(attempt.case_id, []).append(attempt)
