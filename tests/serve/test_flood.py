@@ -42,6 +42,7 @@ MEMORY_MB = 200
 # buffers and heaps.
 UPLOADS_MEMORY_MB = 256
 ATTEMPTS = 3  # a machine that does something else meanwhile misleads
+TURNS = 3  # of a robot beside a flood and beside its load, so that both have the same conditions
 # Of p90 on a machine with two cores, of which the flooding process takes one while it begins.
 NOISE_MS = 5.0
 CASES = [
@@ -106,17 +107,22 @@ def test_a_robots_act_takes_less_than_twice_as_long(
 
     p99 of a robot alone is anything from 4 to 90 ms on two cores.
     """
+    attack = (attackers, endpoint, part, where, connections)
     found = []
     for attempt in range(ATTEMPTS):
-        with flood.attacking(attackers, endpoint, part, where, connections) as attack:
-            await_calm(where["pid"])
-            with attack.measured() as loads:
-                beside = flood.acts_ms(robot, SECONDS)
-        alone = acts_alone
-        if attempt:
-            await_calm(where["pid"])
-            with flood.loading(attackers, *loads):
-                alone = flood.acts_ms(robot, SECONDS)
+        seconds = SECONDS / TURNS if attempt else SECONDS
+        alone, beside = ([], []) if attempt else (acts_alone, [])
+        for _ in range(TURNS if attempt else 1):
+            with flood.attacking(*attack) as running:
+                await_calm(where["pid"])
+                with running.measured() as loads:
+                    beside += flood.acts_ms(robot, seconds)
+            [load] = loads
+            if attempt:
+                await_calm(where["pid"])
+                with flood.loading(attackers, load):
+                    alone += flood.acts_ms(robot, seconds)
+        alone, beside = sorted(alone), sorted(beside)
         p50, p90 = ((flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 90))
         found.append((p50, p90))
         if p50[1] < 2 * p50[0] and p90[1] < 2 * max(p90[0], NOISE_MS):
@@ -303,23 +309,27 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
         name = "replica"
     else:
         name = "HAProxy" if endpoint in flood.HTTP else endpoint
+    held = 0.0
     for attempt in range(ATTEMPTS):
         if attempt or name not in alone_ms:
             await_calm(where["pid"])  # an attempt before this one may have left much to do
         if name not in alone_ms:
             alone_ms[name] = flood.times_ms(call, ROW_SECONDS)
-        alone = alone_ms[name]
-        with flood.attacking(attackers, endpoint, behaviour, where, 8) as attack:
-            if endpoint in flood.GATEWAYS and behaviour.startswith("half a message"):
-                await_calm(where["pid"])  # 400 MB arrive at first
-            with attack.measured() as loads:
-                beside = flood.times_ms(call, ROW_SECONDS)
-            held = resources(where["pid"])[0] - memory
-        [load] = loads
-        if attempt:
-            await_calm(where["pid"])
-            with flood.loading(attackers, load):
-                alone = flood.times_ms(call, ROW_SECONDS)
+        seconds = ROW_SECONDS / TURNS if attempt else ROW_SECONDS
+        alone, beside = ([], []) if attempt else (alone_ms[name], [])
+        for _ in range(TURNS if attempt else 1):
+            with flood.attacking(attackers, endpoint, behaviour, where, 8) as attack:
+                if endpoint in flood.GATEWAYS and behaviour.startswith("half a message"):
+                    await_calm(where["pid"])  # 400 MB arrive at first
+                with attack.measured() as loads:
+                    beside += flood.times_ms(call, seconds)
+                held = max(held, resources(where["pid"])[0] - memory)
+            [load] = loads
+            if attempt:
+                await_calm(where["pid"])
+                with flood.loading(attackers, load):
+                    alone += flood.times_ms(call, seconds)
+        alone, beside = sorted(alone), sorted(beside)
         p50, p90, p99 = (
             (flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 90, 99)
         )
