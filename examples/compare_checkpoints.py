@@ -1,6 +1,6 @@
 """Compare two checkpoints: is the later one better, or was it luck?
 
-Both play the same episodes; the decisive ones are those that only one checkpoint solves. `python
+Both run the same episodes. Only episodes that exactly one checkpoint solves are decisive. `python
 compare_checkpoints.py` runs 2 x 40 episodes in this process, in seconds, and prints the difference
 with its interval and McNemar's test, for each environment and for all. The checkpoints are
 simulated: an expert whose hand drifts less after longer training.
@@ -25,10 +25,8 @@ class Trainee(Scripted):
     """A simulated policy with checkpoints."""
 
     def reset(self, obs, instruction, checkpoint_step=0, seed=0, **kwargs):
-        """Begin an episode with that checkpoint; its drift depends on the seed of the episode
-        alone.
-        """
-        drift = 0.35 * 0.5 ** (checkpoint_step / 5000)  # per action
+        """Begin an episode; the drift depends on the checkpoint and the seed of the episode."""
+        drift = 0.35 * 0.5 ** (checkpoint_step / 5000)  # drift per action
         self.drift = np.random.default_rng(seed).normal(0, drift, 3).astype(np.float32)
         return super().reset(obs, instruction, **kwargs)
 
@@ -40,7 +38,7 @@ class Trainee(Scripted):
 
 
 def main():
-    """Play the episodes, and compare the checkpoints."""
+    """Run the episodes, and compare the checkpoints."""
     plan = EvalConfig(
         policies=[{"name": "trainee", "steps": [2000, 8000]}],
         suites=[{"name": env, "envs": [env], "episodes": 20} for env in ENVS],

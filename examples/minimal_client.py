@@ -1,5 +1,6 @@
-"""A client on one screen; copy minimal_client.py into a robot's program, which needs numpy,
-simplejpeg and websockets.
+"""A minimal client.
+
+Copy minimal_client.py into a robot's program; it needs numpy, simplejpeg and websockets.
 
     with Policy("ws://gpu-box:8000/v1/stream") as policy:
         policy.reset({"front": image}, {"joints": joints}, instruction="stack the cups")
@@ -21,7 +22,7 @@ import numpy as np
 import simplejpeg
 from websockets.sync.client import connect
 
-Arrays = dict[str, np.ndarray]  # by camera, or by part of the state
+Arrays = dict[str, np.ndarray]  # arrays by camera, or by part of the state
 _PREFIX = struct.Struct("<3sBI")  # b"VLA", protocol version, bytes of the header
 
 
@@ -32,8 +33,9 @@ class PolicyError(Exception):
 
 
 class Policy(ExitStack):
-    """One session, open until `close`; `jpeg` is the quality of its images, up to 100, and None
-    sends raw pixels.
+    """A session, open until `close`.
+
+    `jpeg` is the quality of images, up to 100; None sends raw pixels.
     """
 
     def __init__(
@@ -49,8 +51,9 @@ class Policy(ExitStack):
     def reset(
         self, cameras: Arrays, state: Arrays, gripper: float | None = None, **task: Any
     ) -> dict[str, Any]:
-        """Begin an episode with its first observation; `task` may hold an `instruction` and
-        `kwargs` of the policy.
+        """Begin an episode with its first observation.
+
+        `task` may contain an `instruction` and `kwargs` of the policy.
         """
         return dict(self._call("reset", cameras, state, gripper, **task)["info"])
 
@@ -87,7 +90,7 @@ class Policy(ExitStack):
         for blob in blobs:
             frame += bytes(-len(frame) % 8) + blob  # each blob begins at a multiple of 8
         self._socket.send(frame)
-        while True:  # until the answer to this request; skip late ones to abandoned requests
+        while True:  # until the answer to this request, skipping late answers to abandoned requests
             data = self._socket.recv(max(0.0, end - time.monotonic()), decode=False)
             at = _PREFIX.size + _PREFIX.unpack_from(data)[2]
             text, blobs = data[_PREFIX.size : at], []

@@ -1,9 +1,9 @@
 """Wrap your own simulator, so that policies are evaluated in it.
 
 `Crane` is the simulator, with other units, colours and conventions than this project. You write
-`CraneEnv`. `python own_env.py` checks it, in the folder of this file, and `vlagents-ray eval
-own_env:CraneEnv --policy NAME --out runs/crane` evaluates a policy in it; own_policy.py is one that
-works. `vlagents-ray init env NAME` writes a skeleton with its test.
+`CraneEnv`. In the folder of this file, `python own_env.py` checks it, and `vlagents-ray eval
+own_env:CraneEnv --policy NAME --out runs/crane` evaluates a policy in it. own_policy.py contains a
+policy that solves the task. `vlagents-ray init env NAME` writes a skeleton with its test.
 """
 
 import numpy as np
@@ -40,16 +40,18 @@ class Crane:
 class CraneEnv(EvalEnv):
     """The task: move the hook to within 5 cm of the mark."""
 
-    max_steps = 40  # after which an episode is cut off
-    STEP_MM = 80  # that an action of 1 moves the hook by
+    max_steps = 40  # number of steps after which an episode is truncated
+    STEP_MM = 80  # distance by which an action of 1 moves the hook
 
-    def __init__(self, side=96, camera_turn=120):  # px, degrees: `--env-set camera_turn=0`
+    # Image size, px, and rotation of the camera, degrees: `--env-set camera_turn=0`.
+    def __init__(self, side=96, camera_turn=120):
         self.crane, self.side, self.camera_turn = Crane(), side, camera_turn
 
     @property
     def contract(self):
-        """The observations and actions: a policy that does not fit is rejected before the first
-        step.
+        """The observations and actions.
+
+        A policy that does not fit is rejected before the first step.
         """
         return Contract(
             cameras={"front": CameraSpec(self.side, self.side)},
@@ -77,8 +79,8 @@ class CraneEnv(EvalEnv):
         self.crane.drive(*(self.STEP_MM * np.clip(one_row(act, self.contract), -1, 1)))
         self.steps += 1
         success = self._distance() < 0.05
-        # Terminated: it cannot continue. Truncated: the step limit. Success is stated apart, and
-        # counted.
+        # `terminated` means that the episode cannot continue, and `truncated` that the step limit
+        # is reached. Success is reported separately, and is what an evaluation counts.
         return (
             self._observe(),
             before - self._distance(),
@@ -94,12 +96,13 @@ class CraneEnv(EvalEnv):
         return float(np.linalg.norm(self.crane.hook - self.crane.mark)) / 1000  # m
 
     def _observe(self):
-        picture = self.crane.photo(self.side)[..., ::-1].copy()  # RGB, in new arrays each time
+        # RGB, in new arrays for each observation.
+        picture = self.crane.photo(self.side)[..., ::-1].copy()
         return Obs(
             cameras={"front": picture}, state={"xy": (self.crane.hook / 1000).astype(np.float32)}
         )
 
 
 if __name__ == "__main__":
-    check_env(CraneEnv())  # raises what is wrong with it
+    check_env(CraneEnv())  # raises an error that lists all problems
     print("CraneEnv keeps its contract")

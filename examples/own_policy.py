@@ -1,7 +1,7 @@
 """Serve your own policy.
 
-`Servo` finds the red hook and the green mark in the picture of own_env.py, and moves the hook
-towards the mark; your model replaces its 2 x 2 weights. In the folder of this file,
+`Servo` finds the red hook and the green mark in the image of own_env.py, and moves the hook towards
+the mark. Your model replaces its 2 x 2 weights. In the folder of this file,
 
     python own_policy.py  # checks it, and runs 20 episodes without a server
     vlagents-ray serve own_policy:Servo --set camera_turn=120  # in another terminal
@@ -24,18 +24,17 @@ from vlagents_ray.testing import check_agent
 
 
 class ServoConfig(BaseModel, extra="forbid"):
-    """The settings: `--set camera_turn=120`, or `config:` in a deployment file. Unknown keys are
-    refused.
+    """The settings: `--set camera_turn=120`, or `config:` in a deployment file.
+
+    Unknown keys are errors.
     """
 
-    camera_turn: float = Field(
-        default=0.0, description="degrees by which the camera is mounted turned"
-    )
+    camera_turn: float = Field(default=0.0, description="rotation of the mounted camera, degrees")
 
 
 def offset(picture):
-    """Return the vector from hook to mark in a picture, (H, W, 3) uint8 RGB: (2,) picture
-    widths, x right, y down.
+    """Return the vector from hook to mark in an image, (H, W, 3) uint8 RGB: (2,) image widths, x
+    right, y down.
     """
     red, green = picture[..., 0] > 200, picture[..., 1] > 200
     if not (red.any() and green.any()):
@@ -48,20 +47,19 @@ def offset(picture):
 
 
 class Servo(TrainableAgent):
-    """Moves the hook along the offset in the picture, rotated by the mounting angle of the
-    camera.
-    """
+    """Moves the hook along the offset in the image, rotated by the mounting angle of the camera."""
 
     Config = ServoConfig
-    trainable = "weights"  # rl_loop.py gives it new ones while it is served
+    trainable = "weights"  # rl_loop.py pushes new values while the policy is served
 
     def __init__(self, config=None):
         self.config = config or ServoConfig()
 
     @property
     def contract(self):
-        """The inputs and outputs; a robot or an environment that does not fit gets an error with
-        the difference.
+        """The inputs and outputs.
+
+        A robot or an environment that does not fit receives an error with the difference.
         """
         return Contract(
             cameras={"front": CameraSpec()},
@@ -72,13 +70,12 @@ class Servo(TrainableAgent):
         """Load the weights, once in a replica."""
         turn = np.deg2rad(self.config.camera_turn)
         back = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-        self.weights = {"gain": (10 * back).astype(np.float32)}  # (2, 2), actions per picture width
+        self.weights = {"gain": (10 * back).astype(np.float32)}  # (2, 2), actions per image width
 
     def reset(self, obs, instruction, spread=0.0, seed=0, **kwargs):
-        """Begin an episode on this session's copy of the policy; the options come from the
-        client.
-        """
-        self.spread, self.rng = spread, np.random.default_rng(seed)  # of a learner's exploration
+        """Begin an episode on this session's copy; the options come from the client."""
+        # Standard deviation of a learner's exploration.
+        self.spread, self.rng = spread, np.random.default_rng(seed)
         return {}
 
     def act_batch(self, obs, sessions):
@@ -100,7 +97,7 @@ class Servo(TrainableAgent):
 if __name__ == "__main__":
     env = "own_env:CraneEnv"
     with make_env(env) as crane:
-        check_agent(Servo(), obs=crane.reset(seed=0)[0])  # raises what is wrong with it
+        check_agent(Servo(), obs=crane.reset(seed=0)[0])  # raises an error that lists all problems
     out = time.strftime("runs/servo-%H%M%S")
     plan = EvalConfig(
         policies=[{"name": "servo"}], suites=[{"envs": [env], "episodes": 20}], workers=0, out=out

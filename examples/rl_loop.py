@@ -1,15 +1,15 @@
 """Reinforcement learning with the server in the loop: a policy learns the mounting angle of its
 camera.
 
-The policy of own_policy.py acts in a server, workers play episodes in own_env.py with it, and this
+The policy of own_policy.py runs in a server, workers run episodes in own_env.py with it, and this
 program learns from their transitions (REINFORCE) and pushes new weights. In the folder of this
 file, in two terminals:
 
     vlagents-ray serve own_policy:Servo
     python rl_loop.py http://localhost:8000
 
-It needs the extra 'learn'. learn/train.py is the same loop around a torch policy that sees images
-and reads words, with cloning, PPO, a teacher and GRPO: docs/tutorials/learn.md.
+It needs the extra 'learn'. learn/train.py is the same loop for a torch policy with images and
+words, with cloning, PPO, a teacher and GRPO: docs/tutorials/learn.md.
 """
 
 import sys
@@ -28,7 +28,9 @@ ITERATIONS, EPISODES, RATE = 4, 32, 80.0
 
 
 class Learner:
-    """Trains a policy's gain towards the actions that moved the hook nearer than others."""
+    """Trains a policy's gain towards the actions that moved the hook nearer to the mark than
+    other actions.
+    """
 
     def __init__(self):
         self.policy = Servo()
@@ -38,8 +40,8 @@ class Learner:
         """Take a step along the policy gradient.
 
         Args:
-            columns: Of T transitions: cameras.front (T, H, W, 3) uint8, action (T, 2), reward (T,),
-                the metres gained.
+            columns: The columns of T transitions: cameras.front (T, H, W, 3) uint8, action (T, 2),
+                and reward (T,), the distance gained, m.
         """
         gain = self.policy.weights["gain"]
         seen = np.stack([offset(picture) for picture in columns["cameras.front"]])  # (T, 2)
@@ -53,12 +55,13 @@ class Learner:
 
 def main(url):
     """Learn for several iterations, and evaluate before and after on held-out episodes."""
-    join(url, log_to_driver=False)  # so that the workers run in the server's Ray, beside the policy
+    # So that the workers run in the server's Ray cluster, next to the policy.
+    join(url, log_to_driver=False)
     learner = Learner()
     held_out = {"envs": [ENV], "episodes": 20, "seeds": [10_000]}
     out = time.strftime("runs/rl-%H%M%S")
     plan = EvalConfig(policies=[{"name": "servo"}], suites=[held_out], out=out, video="none")
-    # In this process; with the URL, in workers.
+    # The evaluation runs in this process. With the URL as policy, it would run in workers.
     evaluation = TrainingEvaluation(learner.policy, plan)
     exploring = {"policy_options": {"spread": SPREAD}}
     with (

@@ -1,14 +1,14 @@
-"""A robot's loop: a steady rate, a guard that checks every action before the arm executes it, and a
-watchdog.
+"""A robot's control loop with a steady rate, a guard that checks every action before the arm
+executes it, and a watchdog.
 
-The arm is simulated, and the policy draws joint targets at random. So the guard rejects distant
-targets, and the arm holds its pose at those ticks. In two terminals:
+The arm is simulated, and the policy draws joint targets at random. The guard therefore rejects
+distant targets, and the arm holds its pose at these ticks. In two terminals:
 
     vlagents-ray serve random --set chunk=10 --set low=-0.3 --set high=0.3
     python robot_loop.py http://localhost:8000
 
-docs/tutorials/robot.md leads to your own arm, docs/control_loop.md explains chunks, modes and safe
-actions.
+docs/tutorials/robot.md describes how to connect your own arm, and docs/control_loop.md explains
+chunks, modes and safe actions.
 """
 
 import sys
@@ -20,20 +20,21 @@ from vlagents_ray.robot.simulated import SimulatedRobot
 
 def main(url):
     """Drive the arm for two seconds at 50 Hz, and print the report."""
-    arm = SimulatedRobot()  # of yours: observe() -> Obs, apply(action), stop()
+    arm = SimulatedRobot()  # replace it with your arm: observe() -> Obs, apply(action), stop()
     agent = RemoteAgent(url, timeout_s=5)
     guard = Guard(
         agent.contract,
-        low=-1.0,  # rad, of every joint; the stricter of these and the contract's
+        low=-1.0,  # limits of every joint, rad; stricter limits in the contract also apply
         high=1.0,
-        max_step=0.5,  # rad, from one action to the next
-        # Where the arm is, for the first action and after a stop.
+        max_step=0.5,  # largest change from one action to the next, rad
+        # The measured pose is used for the first action and after a stop.
         measure=lambda obs: obs.state["joints"],
     )
-    # Stops the arm when an answer is overdue by 1 s, or the loop has not ticked for 0.2 s.
+    # The watchdog stops the arm when an answer is overdue by 1 s, or the loop has not ticked for
+    # 0.2 s.
     watchdog = Watchdog(lambda _reason: arm.stop(), {"server": 1.0, "loop": 0.2})
-    # In "async" the next chunk is requested while the last one is executed, so that no tick waits
-    # for the network.
+    # In "async", the next chunk is requested while the current chunk is executed, so that no tick
+    # waits for the network.
     with ChunkPlayer(agent, PlayerSettings(mode="async", safe="hold"), check=guard) as player:
         report = run_loop(
             arm, player, hz=50, seconds=2, instruction="stack the cups", watchdog=watchdog

@@ -1,13 +1,13 @@
-"""Evaluate a sweep over the rotation of a camera from its calibration and the noise of actions.
+"""Evaluate a sweep over the rotation of a camera and the noise of actions.
 
-Two policies differ in an option of their resets, and five suites in an option of the environment:
-ten cases, all on the same seeds. `python sweep.py`, in the folder of this file, runs them in this
-process, in seconds, with the policy and the environment of own_policy.py and own_env.py; run again,
-it continues an interrupted sweep.
+Two policies differ in an option of their resets, and five suites differ in an option of the
+environment. This gives ten cases, all with the same seeds. In the folder of this file, `python
+sweep.py` runs the cases in this process, in seconds, with the policy of own_policy.py and the
+environment of own_env.py. If it is run again, it continues an interrupted sweep.
 
-As a file, the same plan is run by `vlagents-ray eval FILE` with a served policy and many
-workers: examples/evaluations/sweep.yaml sweeps over the checkpoints of a training run,
-examples/evaluations/realtime.yaml over latencies.
+`vlagents-ray eval FILE` runs such a plan from a file, with a served policy and many
+workers: examples/evaluations/sweep.yaml sweeps over the checkpoints of a training run, and
+    examples/evaluations/realtime.yaml over latencies.
 """
 
 from itertools import groupby
@@ -17,11 +17,12 @@ from own_policy import Servo, ServoConfig
 from vlagents_ray.evaluate import EvalConfig, evaluate
 
 CALIBRATED = 120  # degrees
-TURNS, SPREADS = (0, 30, 60, 90, 120), (0.0, 1.0)  # degrees; standard deviation of each action
+# Degrees; the standard deviation of each action's noise.
+TURNS, SPREADS = (0, 30, 60, 90, 120), (0.0, 1.0)
 
 
 def main():
-    """Play the episodes without a result, and print a row for each policy."""
+    """Run the episodes without a result, and print a row for each policy."""
     plan = EvalConfig(
         policies=[
             {"name": f"spread {spread}", "options": {"spread": spread}} for spread in SPREADS

@@ -1,9 +1,9 @@
 """Use a model in another system's server: `policy: upstream`.
 
-Here the server is openpi's: `theirs` implements its protocol in a few lines, in place of
-`scripts/serve_policy.py` in a checkout of openpi. The policy `upstream` connects to it, and an
-evaluation plays with the policy. `python upstream.py` does both in this process. With the real
-server at ws://gpu-box:9000,
+In this example, the server is openpi's: `theirs` implements openpi's protocol in a few lines, and
+replaces `scripts/serve_policy.py` in a checkout of openpi. The policy `upstream` connects to the
+server, and an evaluation runs episodes with the policy. `python upstream.py` does both in this
+process. With the real server at ws://gpu-box:9000,
 
     python upstream.py ws://gpu-box:9000  # runs the same episodes, if its keys are those below
     vlagents-ray serve deployments/upstream.yaml  # adds batches, sessions, keys and the live page
@@ -25,7 +25,7 @@ from websockets.sync.server import serve
 from vlagents_ray.evaluate import EvalConfig, evaluate, print_summary
 from vlagents_ray_dialects.upstream import Upstream
 
-MAPPING = {  # our names on the left, the server's on the right
+MAPPING = {  # our names -> the server's names
     "cameras": {"front": "observation/image"},
     "state": {"xyzrpy": "observation/state"},
     "instruction": "prompt",
@@ -34,15 +34,15 @@ MAPPING = {  # our names on the left, the server's on the right
 
 @contextlib.contextmanager
 def theirs():
-    """Run a server with openpi's protocol; its model moves the hand to the middle of the table."""
+    """Run a server with openpi's protocol. Its model moves the hand to the middle of the table."""
 
     def answer(connection):
         connection.send(msgpack.packb({"robot": "example"}))  # the server's metadata
         for message in connection:
             observation = msgpack.unpackb(message)
-            # (6,), m and rad.
+            # The pose, (6,), m and rad.
             pose = np.frombuffer(observation["observation/state"][b"data"], np.float32)
-            # (10, 4), a chunk.
+            # A chunk, (10, 4).
             actions = np.tile(np.append(-0.5 * pose[:3], 1).astype(np.float32), (10, 1))
             array = {
                 b"__ndarray__": True,

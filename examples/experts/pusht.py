@@ -1,5 +1,5 @@
-"""An expert for PushT: tries pushes from all sides of the block in its own simulator, and runs
-the best.
+"""An expert for PushT, which tries pushes from all sides of the block in its own simulator, and
+executes the best one.
 """
 
 from __future__ import annotations
@@ -15,35 +15,38 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.experts import sim_vector
 from vlagents_ray.registry import require
 
-_SIZE = 7  # position and velocity of the agent, 2 each; position of the block, 2, and its angle
+# Numbers of the state: position (2) and velocity (2) of the agent, position (2) and angle (1) of
+# the block.
+_SIZE = 7
 _FIELD_PX = 512.0
-_CLEAR_PX = 6.0  # between agent and block on the way around it
-_APART_PX = 30.0  # between two places from which pushes are tried
-_WALK_PX = 50.0  # each step of the way around the block
-_PUSHES_PX = (16.0, 6.0, 2.0)  # steps of a push, from coarse to fine
+_CLEAR_PX = 6.0  # distance between agent and block on the path around the block
+_APART_PX = 30.0  # distance between two positions from which pushes are tried
+_WALK_PX = 50.0  # length of each step of the path around the block
+_PUSHES_PX = (16.0, 6.0, 2.0)  # step lengths of a push, from coarse to fine
 _PUSH_STEPS = 12
-_STEP_COSTS_PX = 0.15  # least reduction of the error by a further step
-_WORSE_PX = 5.0  # a trial ends once its error is this much above its lowest one
-_ASTRAY_PX = 2.0  # largest error of the predicted corners of the block before a new plan
-# The agent follows its target as a critically damped spring of 10 rad/s. In a step, 0.1 s, it
-# covers this share of the distance, and its velocity carries it on for this long.
+_STEP_COSTS_PX = 0.15  # smallest reduction of the error that justifies a further step
+_WORSE_PX = 5.0  # a trial ends when its error exceeds its lowest error by this amount
+_ASTRAY_PX = 2.0  # error of the block's predicted corners above which a new push is planned
+# The agent follows its target as a critically damped spring of 10 rad/s. In a step of 0.1 s, the
+# agent covers this share of the distance, and then continues with its velocity for this time.
 _COVERED = 1 - 2 / math.e
 _CARRIED_S = 0.1 / math.e
 
 
 class _Step(NamedTuple):
     action: np.ndarray  # (2,) float32, px
-    expected: np.ndarray  # (7,), the state after it
+    expected: np.ndarray  # state after the action, (7,)
     solves: bool
 
 
 class PushTExpert:
-    """Solves PushT by `info["sim_state"]` of `vlagents_ray.envs.gymnasium`; actions are (2,) in [0,
-    512] px.
+    """Solves PushT with `info["sim_state"]` of `vlagents_ray.envs.gymnasium`.
 
-    A push moves straight towards the block, from one of several places around it, at one of three
-    speeds. The expert chooses the push, and the step at which it ends, that brings the block's
-    corners nearest to the target's.
+    Actions are (2,) in [0, 512] px.
+
+    A push moves straight towards the block, from one of several positions around the block, at one
+    of three speeds. The expert chooses the push and its last step so that the block's corners come
+    as near as possible to the target's corners.
     """
 
     def __init__(self, env_name: str) -> None:
@@ -53,11 +56,12 @@ class PushTExpert:
         self._sim.reset(seed=0)
         parts = [self._shapely.Polygon(part.get_vertices()) for part in self._sim.block.shapes]
         outline = self._shapely.union_all(parts).normalize()
-        # (N, 2) px, in the block's frame.
+        # The corners of the block in the block's frame, (N, 2) px.
         self._corners: np.ndarray = self._shapely.get_coordinates(outline)
         self._target = self._placed(self._sim.goal_pose)
         [disc] = self._sim.agent.shapes
-        self._reach = disc.radius + _CLEAR_PX  # from the block to the agent's centre
+        # Smallest distance from the block to the agent's centre.
+        self._reach = disc.radius + _CLEAR_PX
         self._plan: deque[_Step] = deque()
         self._expected = np.zeros(_SIZE)
 
@@ -66,7 +70,7 @@ class PushTExpert:
         self._plan.clear()
 
     def act(self, obs: Obs) -> Act:
-        """Compute the next action, (2,) float32; the choice of a new push takes longer."""
+        """Compute the next action, (2,) float32. Choosing a new push takes longer."""
         state = sim_vector(obs, _SIZE, self._name)
         if not self._plan or self._error(state, self._placed(self._expected[4:])) > _ASTRAY_PX:
             self._plan = deque(self._best_push(state))
@@ -78,7 +82,7 @@ class PushTExpert:
         block = self._shapely.Polygon(self._placed(state[4:]))
         around = block.buffer(self._reach)
         still = np.clip(state[:2], 0, _FIELD_PX).astype(np.float32)
-        best = [_Step(still, state, solves=False)]  # stays the best if the block lies out of reach
+        best = [_Step(still, state, solves=False)]  # remains the best if the block is out of reach
         lowest = math.inf
         for share in np.arange(0, 1, _APART_PX / around.length):
             place = around.exterior.interpolate(share, normalized=True)
@@ -104,7 +108,7 @@ class PushTExpert:
         return best
 
     def _way(self, around: Any, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return the places of the steps from `start` to `end`, (N, 2) px, along a polygon
+        """Return the positions of the steps from `start` to `end`, (N, 2) px, along a polygon
         around the block.
         """
         ring = around.exterior
@@ -117,7 +121,8 @@ class PushTExpert:
         rest = min(sides, key=lambda side: (np.sum((side < 0) | (side > _FIELD_PX)), len(side)))
         inside = around.buffer(-_CLEAR_PX / 4)
         corners = [start]
-        while len(rest):  # straight to the farthest place in sight, or else out of the polygon
+        # Move straight to the farthest position in sight, or out of the polygon if there is none.
+        while len(rest):
             lines = self._shapely.linestrings([[corners[-1], place] for place in rest])
             seen = np.flatnonzero(~self._shapely.crosses(lines, inside))
             chosen = int(seen[-1]) if len(seen) else 0
@@ -131,11 +136,12 @@ class PushTExpert:
         return np.asarray(self._shapely.get_coordinates(places))
 
     def _play(self, state: np.ndarray, places: np.ndarray) -> Iterator[_Step]:
-        """Simulate steps that move the agent to each of `places`, (N, 2) px, in turn."""
+        """Simulate steps that move the agent to each of `places`, (N, 2) px, one after another."""
         sim = self._sim
-        sim._setup()  # a new space, since a used one keeps its contacts
+        sim._setup()  # a new physics space, since a used space keeps its contacts
         sim.agent.position, sim.agent.velocity = tuple(state[:2]), tuple(state[2:4])
-        # Before the position, as it turns the block about its centre of gravity.
+        # The angle is set before the position, since setting it turns the block about its centre of
+        # gravity.
         sim.block.angle = state[6]
         sim.block.position = tuple(state[4:6])
         for place in places:

@@ -1,4 +1,4 @@
-"""An expert for FetchReach of Gymnasium-Robotics, from the positions in the state."""
+"""An expert for FetchReach of Gymnasium-Robotics, which uses the positions in the state."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import numpy as np
 from vlagents_ray.errors import MissingState
 from vlagents_ray.interface import Act, Obs
 
-_METRES_PER_UNIT = 0.05  # Gymnasium-Robotics, MujocoFetchEnv._set_action
-_GAIN = 0.5  # share of the remaining distance in each step, so that the arm does not overshoot
+_METRES_PER_UNIT = 0.05  # from MujocoFetchEnv._set_action of Gymnasium-Robotics
+# Share of the remaining distance that each step covers, so that the arm does not overshoot.
+_GAIN = 0.5
 
 
 class FetchReach:
-    """Moves the hand straight to the target and holds it there; actions are (4,) in [-1, 1]."""
+    """Moves the hand straight to the target and holds it there. Actions are (4,) in [-1, 1]."""
 
     def __init__(self, env_name: str) -> None:
         self._name = env_name

@@ -1,4 +1,4 @@
-"""The student's perception: the places of each colour on the table, and the colour in the
+"""The student's perception: the positions of each colour on the table, and the colour in the
 instruction.
 """
 
@@ -13,14 +13,14 @@ from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW
 from vlagents_ray.envs.tabletop.world import PUCK_HEIGHT
 from vlagents_ray.errors import InvalidObservation
 
-# Degrees of the colour wheel.
+# The hue of each colour on the colour wheel, degrees.
 _ANGLES = {"red": 1.0, "yellow": 46.0, "green": 133.0, "blue": 216.0, "purple": 274.0}
 WORDS = tuple(_ANGLES)
-_HUES = 12  # bins of the colour wheel
-BINS = 2 * _HUES  # those of pale colours, then those of full ones
-_COLOURED = 0.12  # least difference of the largest and the smallest channel, of 1
-_FULL = 0.5  # least saturation of full colours
-_PIXELS = 20.0  # unit of the first column
+_HUES = 12  # number of bins of the colour wheel
+BINS = 2 * _HUES  # number of bins: first the pale colours, then the saturated colours
+_COLOURED = 0.12  # smallest difference of the largest and the smallest channel, in [0, 1]
+_FULL = 0.5  # smallest saturation of saturated colours
+_PIXELS = 20.0  # unit of the first column, pixels
 
 
 def places(image: np.ndarray) -> np.ndarray:
@@ -30,8 +30,9 @@ def places(image: np.ndarray) -> np.ndarray:
         image: The camera's image, (H, W, 3) uint8.
 
     Returns:
-        For each bin the number of its pixels in units of 20, and the middle x and y of them in dm
-        on the table as the camera is aimed at it, 0 if there are none, (24, 3) float32.
+        For each bin, the number of its pixels in units of 20, and their mean x and y on the table
+        in dm from the point at which the camera is aimed, (24, 3) float32. Bins without pixels are
+        0.
     """
     height, width = image.shape[:2]
     pixels = image.reshape(-1, 3).astype(np.float32) / 255.0
@@ -60,14 +61,14 @@ def places(image: np.ndarray) -> np.ndarray:
 
 
 def puck_position(image: np.ndarray, colour: str) -> tuple[float, float] | None:
-    """Return the position of a puck, (x, y) m, from the middle of its pixels; None if fewer than
-    three are visible.
+    """Return the position of a puck, (x, y) m, from the mean of its pixels; None if fewer than
+    three pixels are visible.
     """
     middle = round(_ANGLES[colour] / 360 * _HUES)
     number, x, y = places(image)[[_HUES + (middle + step) % _HUES for step in (-1, 0, 1)]].T
     if number.sum() * _PIXELS < 3:
         return None
-    # m, apparent additional distance of the puck's middle.
+    # Apparent additional distance of the puck's middle, m.
     above = PUCK_HEIGHT / 2 / math.tan(ELEVATION)
     return float(number @ x / number.sum()) / 10, float(number @ y / number.sum()) / 10 - above
 

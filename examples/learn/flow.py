@@ -1,14 +1,14 @@
-"""The reference policy, which acts by flow matching, becomes faster by reinforcement learning from
-pixels.
+"""Reinforcement learning from pixels, which makes the reference policy, a flow matching policy,
+faster.
 
     python examples/learn/flow.py learn grpo --out runs/grpo-0
     python examples/learn/flow.py learn ppo --seed 1 --out runs/ppo-1
     python examples/learn/flow.py compare runs/grpo-0 runs/grpo-1
 
-An action of the learner is an action chunk, with the log-probability of its random steps
-(Flow-SDE). Policy, rollouts and learner share this process, without Ray; with --max-lag the policy
-is served, and a worker runs while the learner learns. docs/tutorials/learn.md explains it. It
-needs torch, pyarrow and a checkout.
+An action of the learner is an action chunk, with the log-probability of the chunk's random steps
+(Flow-SDE). Policy, rollouts and learner share this process, without Ray. With --max-lag, the policy
+is served, and a worker runs episodes while the learner learns. docs/tutorials/learn.md explains it.
+It needs torch, pyarrow and a checkout.
 """
 
 from __future__ import annotations
@@ -63,19 +63,22 @@ from vlagents_ray_learn import (
 CHECKPOINT = Path(__file__).parents[2] / "examples" / "reference" / "checkpoint"
 ENV = ROBOT = "tabletop"
 ENV_OPTIONS: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
-EXECUTE = 4  # rows of a chunk
-TICKS = 40  # ticks of an episode of the training; with fewer, too few are solved at first
-NUM_ENVS = 64  # that act in one batch
-# Ticks of the evaluations: the policy is to become faster, and to stay as reliable.
+EXECUTE = 4  # executed rows of a chunk
+TICKS = 40  # ticks of a training episode; with fewer ticks, too few episodes are solved at first
+NUM_ENVS = 64  # number of environments whose calls share a batch
+# Ticks of the short and the long evaluation. The policy should become faster, and remain as
+# reliable.
 SHORT, LONG = 32, 80
-TRAINING = 20_000_000  # first seed of the training's episodes; those of the evaluations begin at 0
-# The flow's modules, which alone are trained, as in πRL.
+TRAINING = 20_000_000  # first seed of the training episodes; the seeds of evaluations begin at 0
+# The modules of the flow. Only these are trained, as in πRL.
 HEAD = ("noisy", "when", "why", "blocks", "result")
-NOISE = 0.6  # of the random steps; larger deviations change the reward by more, and so say more
+# Noise level of the random steps; larger deviations change the reward by more, and are thus more
+# informative.
+NOISE = 0.6
 DISCOUNT = 0.96  # per tick
 CLIP = 0.2  # clip of PPO's ratio (arXiv 1707.06347)
-BATCH = 1024  # acts
-RATE, VALUE_RATE = 2e-4, 1e-3  # of AdamW, for the flow and for the value
+BATCH = 1024  # chunks per optimizer step
+RATE, VALUE_RATE = 2e-4, 1e-3  # learning rates of AdamW, for the flow and for the value
 
 Method = Literal["grpo", "ppo"]
 app = typer.Typer(pretty_exceptions_enable=False)
@@ -90,26 +93,29 @@ class FlowPlan(BaseModel):
     out: Path
     seed: Seed = 0
     iterations: Count = 20
-    episodes: Count = 512  # episodes of an iteration
+    episodes: Count = 512  # number of episodes in an iteration
     groups: Count = 8  # episodes from one start state, in "grpo"
-    epochs: Count = 2  # times that an iteration learns from each act
-    max_lag: Retries | None = None  # versions; None: episodes and learner wait for each other
-    evaluate_every: Count = 5  # iterations
+    epochs: Count = 2  # number of times that an iteration learns from each chunk
+    # Largest age of weights in versions; None: episodes and learner wait for each other.
+    max_lag: Retries | None = None
+    evaluate_every: Count = 5  # number of iterations between evaluations
     held_out: Count = 500  # episodes of an evaluation, the same for each version
 
 
 class Learned(NamedTuple):
-    """What a learner reports of an iteration."""
+    """The statistics of a learner's iteration."""
 
-    acts: int  # with an advantage
-    clipped: float  # share of their rows
-    # Standard deviation before the first step, nats; 0 if learner and policy agree.
+    acts: int  # number of chunks with an advantage
+    clipped: float  # share of these chunks' rows that are clipped
+    # Standard deviation of the log ratio before the first step, nats; 0 if learner and policy
+    # agree.
     log_ratio: float
 
 
 class FlowLearner:
-    """Trains the flow of the reference network by GRPO or PPO; what it sees and reads stays as
-    it is.
+    """Trains the flow of the reference network with GRPO or PPO.
+
+    The encoders of images and words are not changed.
     """
 
     def __init__(self, method: Method, seed: int, epochs: int) -> None:
@@ -130,7 +136,7 @@ class FlowLearner:
         flow, value = list(self._trained.values()), list(self._value.parameters())
         groups = [{"params": flow, "lr": RATE}, {"params": value, "lr": VALUE_RATE}]
         self._optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), weight_decay=0.0)
-        self.version = 0  # version of the weights: how often it learned
+        self.version = 0  # version of the weights: the number of iterations so far
 
     def state(self) -> dict[str, torch.Tensor]:
         """Return the trained values by name, for a partial push."""
@@ -140,8 +146,8 @@ class FlowLearner:
         """Take steps of the optimizer on whole episodes.
 
         Args:
-            columns: The transitions, with `logprob` and `replay.chain`; each act has EXECUTE of
-                them.
+            columns: The transitions, with `logprob` and `replay.chain`. Each chunk has EXECUTE
+                transitions.
         """
         contexts, chains = self._contexts(columns), torch.from_numpy(columns["replay.chain"].copy())
         stated = torch.from_numpy(columns["logprob"].reshape(-1, EXECUTE).copy())
@@ -175,8 +181,8 @@ class FlowLearner:
     def _advantages(
         self, columns: Mapping[str, np.ndarray], contexts: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Return the advantages of the rows of acts, (A, EXECUTE), and for PPO the targets of
-        their values, (A,).
+        """Return the advantages of the rows of chunks, (A, EXECUTE), and for PPO the targets of the
+        chunks' values, (A,).
         """
         if self._method == "grpo":
             return torch.from_numpy(group_advantages(columns, DISCOUNT).reshape(-1, EXECUTE)), None
@@ -193,7 +199,7 @@ class FlowLearner:
         return torch.from_numpy(gain.astype(np.float32)), torch.from_numpy(targets)
 
     def _logprob(self, contexts: torch.Tensor, chains: torch.Tensor) -> torch.Tensor:
-        """Return the log-probabilities of the executed rows of acts, (B, EXECUTE), nats."""
+        """Return the log-probabilities of the executed rows of chunks, (B, EXECUTE), nats."""
         ones = torch.ones(len(contexts))
         found = logprob_of_chain(
             lambda a, time: self.network.velocity(contexts, a, time * ones), chains, NOISE
@@ -202,7 +208,7 @@ class FlowLearner:
         return summed
 
     def _contexts(self, columns: Mapping[str, np.ndarray]) -> torch.Tensor:
-        """Return what the flow gets of images, state and words at each act, (A, C)."""
+        """Return the context of the flow from images, state and words for each chunk, (A, C)."""
         rows, robot, found = (
             first_rows(columns),
             self._checkpoint.embodiments[ROBOT],
@@ -210,7 +216,7 @@ class FlowLearner:
         )
         tokens = {text: self._checkpoint.tokens(text) for text in set(columns["instruction"])}
         parts = [name.removeprefix("state.") for name in columns if name.startswith("state.")]
-        # So many images stay in the cache.
+        # This number of images fits into the processor's cache.
         for some in np.array_split(rows, max(1, len(rows) // 64)):
             obs = [
                 Obs({}, float(columns["gripper"][i]), {p: columns[f"state.{p}"][i] for p in parts})
@@ -233,13 +239,13 @@ class FlowLearner:
 
 
 def first_rows(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the first transition of each act, (A,) int64."""
+    """Return the index of the first transition of each chunk, (A,) int64."""
     rows: np.ndarray = np.flatnonzero(np.diff(answers(columns), prepend=-1))
     return rows
 
 
 class FlowRun:
-    """A run: episodes, the learner, a push, and now and then an evaluation."""
+    """A run of iterations: episodes, a learner's steps and a push, with regular evaluations."""
 
     def __init__(self, plan: FlowPlan) -> None:
         self._plan, self._learner = plan, FlowLearner(plan.method, plan.seed, plan.epochs)
@@ -253,7 +259,9 @@ class FlowRun:
         self._evaluated.initialize()
 
     def learn(self) -> None:
-        """Learn; the results are in the plan's folder, and the new checkpoint in its folder
+        """Train the policy for all iterations of the plan.
+
+        The results are written to the plan's folder, and the new checkpoint to the subfolder
         `checkpoint`.
         """
         plan, learner = self._plan, self._learner
@@ -357,18 +365,23 @@ class FlowRun:
 def learn(
     method: Annotated[str, typer.Argument(help=f"One of {', '.join(get_args(Method))}.")],
     out: Annotated[Path, typer.Option(help="New folder of the results.")],
-    seed: Annotated[int, typer.Option(help="Of the training's episodes.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the training episodes.")] = 0,
     iterations: Annotated[int, typer.Option(min=1)] = 20,
     episodes: Annotated[int, typer.Option(min=1, help="Of an iteration.")] = 512,
-    held_out: Annotated[int, typer.Option(min=1, help="Episodes of an evaluation.")] = 500,
+    held_out: Annotated[
+        int, typer.Option(min=1, help="Number of episodes of an evaluation.")
+    ] = 500,
     evaluate_every: Annotated[int, typer.Option(min=1, help="Iterations.")] = 5,
     max_lag: Annotated[
         int | None,
-        typer.Option(min=0, help="Play while learning, with weights at most so many versions old."),
+        typer.Option(
+            min=0,
+            help="Run episodes while learning, with weights at most this number of versions old.",
+        ),
     ] = None,
 ) -> None:
-    """Improve the reference policy from pixels, by the reward of the environment alone."""
-    torch.set_num_threads(1)  # its networks are small
+    """Improve the reference policy from pixels, using only the reward of the environment."""
+    torch.set_num_threads(1)  # the networks are small
     settings = {
         "iterations": iterations,
         "episodes": episodes,
@@ -382,9 +395,9 @@ def learn(
 
 @app.command("compare")
 def compare_runs(
-    folders: Annotated[list[Path], typer.Argument(help="Of runs with different seeds.")],
+    folders: Annotated[list[Path], typer.Argument(help="Folders of runs with different seeds.")],
 ) -> None:
-    """Compare each run's first and last version on the same seeds, by McNemar's exact test."""
+    """Compare each run's first and last version on the same seeds, with McNemar's exact test."""
     with errors(FlowPlan):
         for ticks in (SHORT, LONG):
             gains = []

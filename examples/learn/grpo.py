@@ -1,4 +1,4 @@
-"""The learner of a student of tokens: behaviour cloning, and GRPO."""
+"""The learner of a student whose actions are tokens: behaviour cloning, and GRPO."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import torch
 from learner import NetworkLearner, episodes, inputs_of, until_solved
 from token_student import TokenNetwork, tokens_of
 
-_EPSILON = 1e-6  # beside the standard deviation of a group
+_EPSILON = 1e-6  # added to the standard deviation of a group
 
 
 def group_advantages(columns: Mapping[str, np.ndarray], discount: float = 1.0) -> np.ndarray:
-    """Return the advantages of the actions by the groups of episodes from one start state, (T,)
-    float32.
+    """Return the advantages of the actions, (T,) float32, within groups of episodes from the same
+    start state.
 
     An episode's reward is 1 if the task was solved at any step, times the discount for each step
-    before that one. Each of its actions has the advantage (reward - mean of the group) / (standard
-    deviation of the group + 1e-6) (GRPO, arXiv 2402.03300). It is 0 after the task was solved, and
-    in groups of equal rewards (DAPO, arXiv 2503.14476).
+    before that one. Each action of the episode has the advantage (reward - mean of the group) /
+    (standard deviation of the group + 1e-6) (GRPO, arXiv 2402.03300). The advantage is 0 after the
+    task was solved, and in groups of equal rewards (DAPO, arXiv 2503.14476).
     """
     starts, lengths = episodes(columns)
     kept = until_solved(columns)
@@ -37,12 +37,12 @@ def group_advantages(columns: Mapping[str, np.ndarray], discount: float = 1.0) -
 
 
 class GRPOLearner(NetworkLearner):
-    """Trains the network of a student of tokens."""
+    """Trains the network of a student whose actions are tokens."""
 
     want = ("logprob", "replay")
     batch = 512
     steps_at_once = 20
-    rate = 1e-4  # few episodes are mostly noise, which larger or more steps would learn
+    rate = 1e-4  # with few episodes, larger or more steps would mostly fit noise
     network_class = TokenNetwork
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
@@ -52,7 +52,7 @@ class GRPOLearner(NetworkLearner):
         Args:
             columns: The transitions, with `logprob` and `replay.tokens`, of whole groups of
                 episodes.
-            steps: The number of steps; 0 are taken if no group has both solved and unsolved
+            steps: The number of steps. No step is taken if no group has both solved and unsolved
                 episodes.
         """
         gain = group_advantages(columns)
@@ -68,7 +68,7 @@ class GRPOLearner(NetworkLearner):
             self._step(-self._clipped(ratio, self._tensor(gain, rows)))
 
     def _error(self, seen: Any, actions: np.ndarray) -> Any:
-        """Return the cross-entropy of the actions' tokens, nats a token."""
+        """Return the cross-entropy of the actions' tokens, nats per token."""
         return -self._logprob(seen, tokens_of(actions)).mean()
 
     def _logprob(self, seen: Any, tokens: np.ndarray) -> Any:

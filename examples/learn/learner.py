@@ -19,8 +19,8 @@ from vlagents_ray.interface import Obs
 # Gamma and lambda of generalised advantage estimation (arXiv 1506.02438)
 DISCOUNT, TRACE = 0.98, 0.95
 _CLIP = 0.2  # clip of PPO's ratio (arXiv 1707.06347)
-_RATE, _LOOK_RATE = 2e-3, 1e-2  # learning rates of the network, and of its choice of colours
-_PPO = 0.01  # weight of PPO's loss beside the teacher's advice
+_RATE, _LOOK_RATE = 2e-3, 1e-2  # learning rates of the network, and of its attention to colours
+_PPO = 0.01  # weight of PPO's loss relative to the loss of the teacher's advice
 
 
 def observations(columns: Mapping[str, np.ndarray]) -> list[Obs]:
@@ -46,17 +46,17 @@ def episodes(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]
 
 
 def advice(teacher: RemoteAgent, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Get a served teacher's action at each observation of whole episodes.
+    """Request the action of a served teacher for each observation of whole episodes.
 
-    Each episode is a session of the teacher, and one message has the next step of all sessions, so
-    that the server computes them in batches.
+    Each episode is a session of the teacher. One message contains the next step of all sessions, so
+    that the server computes the actions in batches.
 
     Args:
         teacher: The teacher's client.
         columns: The transitions of whole episodes.
 
     Returns:
-        Its actions, (T, 4) float32.
+        The teacher's actions, (T, 4) float32.
     """
     starts, lengths = episodes(columns)
     seen, texts = observations(columns), columns["instruction"]
@@ -83,11 +83,11 @@ def advice(teacher: RemoteAgent, columns: Mapping[str, np.ndarray]) -> np.ndarra
 
 
 def until_solved(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return which transitions come before the task was solved, or solve it, (T,) bool: only
-    these are learned from.
+    """Return which transitions are used for learning, (T,) bool: all until the one that solves the
+    task.
     """
     (starts, lengths), success = episodes(columns), columns["success"]
-    before = np.cumsum(success) - success  # number of solved steps in the rows before each
+    before = np.cumsum(success) - success  # number of solved steps before each row
     kept: np.ndarray = before == np.repeat(before[starts], lengths)
     return kept
 
@@ -97,8 +97,9 @@ def advantages(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the advantages of the actions, and the targets of the values, each (T,) float32.
 
-    The reward is 1 for the step that solves the task, which ends the episode here; both are 0 after
-    it. An episode that the step limit ends is continued by the value of its last observation.
+    The reward is 1 for the step that solves the task. This step ends the episode here, and later
+    advantages and targets are 0. If the step limit ends an episode, the value of the last
+    observation replaces the remaining rewards.
     """
     value, success, kept = columns["value"], columns["success"], until_solved(columns)
     gain = np.zeros(len(value), np.float32)
@@ -115,19 +116,21 @@ def advantages(
 
 
 class NetworkLearner(ABC):
-    """Trains a student's network by behaviour cloning, and by its subclass's algorithm on the
-    student's episodes.
+    """Trains a student's network with behaviour cloning, and with the algorithm of a subclass on
+    the student's episodes.
     """
 
     want: tuple[str, ...]
-    """What the student states for `improve`, beside its actions."""
+    """The values that the student returns for `improve`, in addition to its actions."""
     network_class: type[LookingNetwork]
     batch = 256
-    """Transitions of a step."""
+    """The number of transitions in a step."""
     steps_at_once = 500
-    """Steps of `improve` on the same transitions, unless the plan says otherwise."""
+    """The number of steps of `improve` on the same transitions, unless the plan sets another
+    number.
+    """
     rate: float | None = None
-    """Learning rate of `improve`; None: those of `imitate`."""
+    """The learning rate of `improve`; None uses the rates of `imitate`."""
 
     def __init__(self, seed: int = 0) -> None:
         """Make a new network."""
@@ -143,7 +146,7 @@ class NetworkLearner(ABC):
             [{"params": look, "lr": _LOOK_RATE}, {"params": others, "lr": _RATE}]
         )
         self._seen = np.empty((0, INPUTS), np.float32)
-        self._advised = np.empty((0, ACTION), np.float32)  # the teacher's action at each
+        self._advised = np.empty((0, ACTION), np.float32)  # the teacher's action for each input
 
     def state(self) -> dict[str, Any]:
         """Return the weights, for a `Publisher`."""
@@ -163,7 +166,7 @@ class NetworkLearner(ABC):
         """Continue from a checkpoint."""
         self.steps = checkpoint["steps"]
         self.network.load_state_dict(checkpoint["network"])
-        # Torch would share and change it.
+        # Copied, since torch would share and change it.
         self._optimizer.load_state_dict(deepcopy(checkpoint["optimizer"]))
         self._seen, self._advised = checkpoint["seen"].numpy(), checkpoint["advised"].numpy()
 
@@ -171,14 +174,16 @@ class NetworkLearner(ABC):
         """Add actions of the teacher to the data for imitation.
 
         Args:
-            seen: Inputs of the network, (T, INPUTS).
+            seen: The inputs of the network, (T, INPUTS).
             actions: The teacher's actions, (T, 4).
         """
         self._seen = np.concatenate([self._seen, seen])
         self._advised = np.concatenate([self._advised, actions])
 
     def imitate(self, steps: int) -> float:
-        """Take steps towards the advice; return the error of the last step."""
+        """Take optimizer steps towards the teacher's advice, and return the error of the last
+        step.
+        """
         error, rng = torch.zeros(()), self._generator()
         for _ in range(steps):
             error = self._distance_to_advice(rng)
@@ -214,7 +219,7 @@ class NetworkLearner(ABC):
         return torch.minimum(ratio * gain, ratio.clamp(1 - _CLIP, 1 + _CLIP) * gain).mean()
 
     def _generator(self) -> np.random.Generator:
-        """Return a generator that is the same after a restore."""
+        """Return a random generator that is the same after a restore."""
         return np.random.default_rng([self._seed, self.steps])
 
     def _drawn(self, rng: np.random.Generator, number: int) -> np.ndarray:
@@ -233,10 +238,11 @@ class NetworkLearner(ABC):
 
 
 class PPOLearner(NetworkLearner):
-    """Trains the student's network by PPO."""
+    """Trains the student's network with PPO."""
 
     want = ("logprob", "value")
-    steps_at_once = 40  # ten times the transitions of 32 episodes: more would fit their noise
+    # Uses the transitions of 32 episodes ten times; more steps would fit their noise.
+    steps_at_once = 40
     rate: float | None = 1e-4
     network_class = Network
 
@@ -264,11 +270,12 @@ class PPOLearner(NetworkLearner):
 
 
 class RPDLearner(PPOLearner):
-    """Trains by refined policy distillation (arXiv 2503.05833): the distance to a teacher's
-    advice is in PPO's loss.
+    """Trains with refined policy distillation (arXiv 2503.05833), which adds the distance to a
+    teacher's advice to PPO's loss.
     """
 
-    steps_at_once = NetworkLearner.steps_at_once  # the advice has no noise, and stays valid
+    # More steps, since the advice has no noise and stays valid.
+    steps_at_once = NetworkLearner.steps_at_once
     rate = None
 
     def _advised_loss(self, loss: Any, rng: np.random.Generator) -> Any:

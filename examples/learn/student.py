@@ -1,5 +1,5 @@
-"""The student: a small trainable policy of images and words, with a value, for learners of
-reinforcement.
+"""The student: a small trainable policy for images and words that also estimates a value, for
+reinforcement learning.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import MissingCamera, MissingState
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs, TrainableAgent
 
-ACTION = 4  # numbers of an action: x, y, z, gripper
-STATE = 4  # of the robot's own state: x, y, z, gripper
-INPUTS = 3 * BINS + STATE + len(WORDS)  # numbers of an input
-_LOOKS = 3  # places that the network looks at
-FEATURES = _LOOKS * 9 + STATE  # numbers that the heads of a network get
-_ROWS = 16  # rows of a pass
-_METRES = 5.0  # units of the robot's position per m
+ACTION = 4  # number of values of an action: x, y, z, gripper
+STATE = 4  # number of values of the robot's state: x, y, z, gripper
+INPUTS = 3 * BINS + STATE + len(WORDS)  # number of values of an input
+_LOOKS = 3  # number of positions that the network attends to
+FEATURES = _LOOKS * 9 + STATE  # number of inputs of the network's heads
+_ROWS = 16  # number of rows of a forward pass
+_METRES = 5.0  # scale of the robot's position, units per m
 
 
 def inputs(obs: Obs, colour: str) -> np.ndarray:
@@ -33,7 +33,7 @@ def inputs(obs: Obs, colour: str) -> np.ndarray:
 
     Args:
         obs: The observation, with the camera "front", the state "xyzrpy" and the gripper.
-        colour: The puck's, out of `WORDS`.
+        colour: The puck's colour, one of `WORDS`.
     """
     if "front" not in obs.cameras:
         raise MissingCamera("front", have=obs.cameras)
@@ -45,12 +45,14 @@ def inputs(obs: Obs, colour: str) -> np.ndarray:
 
 
 class LookingNetwork(nn.Module):
-    """Attends to the places of the colours that the word selects, and to the fingers."""
+    """A network that attends to the positions of the colours that the word selects, and to the
+    fingers.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.look = nn.Linear(len(WORDS), BINS * _LOOKS)
-        self.aim = nn.Linear(2, 2)  # from the camera's places to the robot's
+        self.aim = nn.Linear(2, 2)  # from positions in the camera's frame to the robot's frame
         with torch.no_grad():
             self.aim.weight.copy_(torch.eye(2) * _METRES / 10)
             self.aim.bias.zero_()
@@ -101,13 +103,13 @@ def seeded(make: Callable[[], nn.Module], seed: int) -> Any:
 
 
 class Student(TrainableAgent):
-    """Acts by the mean of a normal distribution, or draws from it if a log-probability is
-    requested.
+    """Returns the mean of a normal distribution as action, or draws from the distribution if a
+    log-probability is requested.
     """
 
     trainable = "network"
     shared = ("network",)
-    behaviour: tuple[str, ...] = ("logprob", "value")  # what it states for a learner
+    behaviour: tuple[str, ...] = ("logprob", "value")  # values that it returns for a learner
     network_class: type[LookingNetwork] = Network
 
     def __init__(self, seed: int = 0) -> None:
@@ -140,8 +142,9 @@ class Student(TrainableAgent):
         return self.act_batch([obs], [self])[0]
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Compute the actions of all sessions, in passes of one size, so that neighbours change
-        no bit of a result.
+        """Compute the actions of all sessions.
+
+        All passes have the same size, so that a result does not depend on other sessions.
         """
         rows = np.zeros((-len(obs) // _ROWS * -_ROWS, INPUTS), np.float32)
         for row, one, session in zip(rows, obs, sessions, strict=False):

@@ -1,5 +1,5 @@
-"""The teacher: it lifts a puck by feedback from each observation, so that it can advise in any
-state.
+"""The teacher, which uses feedback from each observation to lift a puck, so that it can advise in
+any state.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import MissingCamera, MissingState, NotReset
 from vlagents_ray.interface import Act, Agent, Obs
 
-_STEP = 0.03  # m, travel of the fingertips at an action of 1
+_STEP = 0.03  # travel of the fingertips at an action of 1, m
 _GRASP_Z = 0.006  # m
-_FUNNEL = 3.0  # m of height per m of distance from the puck, beyond the nearest `_CENTRED`
+_FUNNEL = 3.0  # height per distance from the puck, m per m, outside of the radius `_CENTRED`
 _CENTRED, _AT, _LOW = 0.004, 0.008, 0.012  # m
-_HIGHEST = 0.08  # m, above the height for grasps
-# m: the fingers hide a part of the puck if they are lower, which shifts it by up to 13 mm.
+_HIGHEST = 0.08  # largest height above the height for grasps, m
+# Heights and distances in m. If the fingers are lower, they hide a part of the puck, which shifts
+# its measured position by up to 13 mm.
 _CLEAR, _MOVED = 0.06, 0.02
-_HELD = (0.5, 0.7)  # the opening of fingers around a puck
+_HELD = (0.5, 0.7)  # range of the opening of fingers around a puck
 _OPEN, _CLOSED = 1.0, -1.0
 
 

@@ -1,4 +1,4 @@
-"""A student whose actions are tokens, as those of OpenVLA, for learners of GRPO."""
+"""A student whose actions are tokens, like OpenVLA's actions, for learning with GRPO."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from student import ACTION, LookingNetwork, Student, head
 
-TOKENS = 11  # bins of each number of an action, whose middles are from -1 to 1
+TOKENS = 11  # number of bins for each value of an action; the centres of the bins are from -1 to 1
 
 
 def tokens_of(actions: np.ndarray) -> np.ndarray:
-    """Return the nearest token of each number of actions, int64; the outermost for those beyond
-    [-1, 1].
+    """Return the nearest token of each number of actions, int64.
+
+    Numbers outside of [-1, 1] have the outermost token.
     """
     found: np.ndarray = np.rint((np.clip(actions, -1.0, 1.0) + 1.0) / 2 * (TOKENS - 1)).astype(
         np.int64
@@ -22,7 +23,7 @@ def tokens_of(actions: np.ndarray) -> np.ndarray:
 
 
 def actions_of(tokens: np.ndarray) -> np.ndarray:
-    """Return the actions of tokens, float32: the middles of their bins."""
+    """Return the actions of tokens, float32: the centres of the tokens' bins."""
     found: np.ndarray = np.linspace(-1.0, 1.0, TOKENS, dtype=np.float32)[tokens]
     return found
 
@@ -44,7 +45,9 @@ class TokenNetwork(LookingNetwork):
 
 
 class TokenStudent(Student):
-    """Acts by the likeliest tokens, or draws them at temperature 1 if a learner requests values."""
+    """Returns the most likely tokens, or draws tokens at temperature 1 if a learner requests
+    values.
+    """
 
     behaviour = ("logprob", "entropy", "replay")
     network_class = TokenNetwork
@@ -54,7 +57,7 @@ class TokenStudent(Student):
 
     def _draw(self, draws: np.random.Generator, *outputs: Any) -> tuple[np.ndarray, dict[str, Any]]:
         logprobs, entropy = outputs
-        # Drawn from the softmax: the Gumbel trick.
+        # With Gumbel noise, the maximum is a draw from the softmax.
         tokens = (logprobs + draws.gumbel(size=logprobs.shape)).argmax(-1)
         logprob = np.take_along_axis(logprobs, tokens[:, None], -1)[:, 0]
         said = {

@@ -1,12 +1,12 @@
-"""A small policy learns to lift pucks of the tabletop from images and words, in minutes on two
-cores.
+"""Training of a small policy that lifts pucks on the tabletop from images and words, in minutes on
+two cores.
 
     python examples/learn/train.py
     python examples/learn/train.py examples/learn/rpd.yaml --seed 1 --out runs/rpd-1
 
-A teacher records demonstrations, and a student clones them (BC). The clone continues with the
-teacher's advice (RPD), or alone (PPO, GRPO), and each version is evaluated on the same seeds.
-docs/tutorials/learn.md explains it. It needs torch and the extra 'learn'.
+A teacher records demonstrations, and a student clones them (BC). The clone then continues to learn
+with the teacher's advice (RPD), or without it (PPO, GRPO). Each version is evaluated on the same
+seeds. docs/tutorials/learn.md explains it. It needs torch and the extra 'learn'.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ HERE = str(Path(__file__).parent.absolute())
 ENV = "tabletop/lift"
 ENV_OPTIONS: dict[str, Any] = {"width": 96, "height": 96, "max_steps": 30}
 TEACHER = "teacher"
-FAILURES = 10  # failures of the policy's server, in one iteration, after which the run ends
-# First seeds: no episode is both run for training and evaluated.
+FAILURES = 10  # number of failures of the policy's server in one iteration after which the run ends
+# First seeds of evaluations and of training, so that no episode is used for both.
 HELD_OUT, TRAINING = 10_000_000, 20_000_000
 
 
@@ -58,18 +58,18 @@ class LearnPlan(BaseModel):
     out: Path = Path("runs/learn")
     resume: bool = False  # continue an interrupted or killed run
     seed: Seed = 0  # seed of the networks, and of the training's episodes
-    demonstrations: Count = 48  # episodes of the teacher
-    clone_steps: Count = 2000  # clone steps of the optimizer
-    iterations: Count = 10  # iterations of each method
-    episodes: Count = 32  # episodes of the student in each iteration
+    demonstrations: Count = 48  # number of the teacher's episodes
+    clone_steps: Count = 2000  # optimizer steps of cloning
+    iterations: Count = 10  # number of iterations of each method
+    episodes: Count = 32  # number of the student's episodes in each iteration
     groups: Count = 8  # episodes from one start state, in "grpo"
     # Steps of the optimizer in each iteration; default: rpd 500, ppo 40, grpo 20.
     steps: Count | None = None
-    evaluate_every: Count = 5  # iterations
+    evaluate_every: Count = 5  # number of iterations between evaluations
     held_out: Count = 200  # episodes of an evaluation, the same for each version
     workers: Count = 2
-    num_envs: Count = 16  # environments of a worker
-    # Trackers that show success rates beside `out`, against the optimizer's steps.
+    num_envs: Count = 16  # number of environments of a worker
+    # Experiment trackers that also show the success rates, against the optimizer's steps.
     track: list[str] = []
 
 
@@ -78,9 +78,9 @@ class MethodParts(NamedTuple):
 
     student: str  # class of the policy
     learner: type[NetworkLearner]
-    learns: bool = True  # whether it continues after the clone
-    advised: bool = False  # whether the teacher advises on each transition
-    grouped: bool = False  # whether several episodes begin in one state
+    learns: bool = True  # whether the method continues after cloning
+    advised: bool = False  # whether the teacher gives advice for each transition
+    grouped: bool = False  # whether several episodes begin in the same state
 
 
 METHODS: dict[Method, MethodParts] = {
@@ -93,7 +93,7 @@ Played = TypeVar("Played")
 
 
 def learn(plan: LearnPlan) -> Summary:
-    """Record demonstrations, clone them, improve the clone by each method, and compare all
+    """Record demonstrations, clone them, improve the clone with each method, and compare all
     versions.
 
     Args:
@@ -104,9 +104,9 @@ def learn(plan: LearnPlan) -> Summary:
         …
 
     Raises:
-        ConfigError: The folder has another run, or has one and `resume` is off.
+        ConfigError: The folder contains another run, or it contains this run and `resume` is off.
     """
-    torch.set_num_threads(1)  # its networks are small
+    torch.set_num_threads(1)  # the networks are small
     # Ray starts the replicas with these variables, and they import the policies from this folder.
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [HERE, os.environ.get("PYTHONPATH")]))
     checkpoints = RunCheckpoints(plan)
@@ -119,12 +119,12 @@ def learn(plan: LearnPlan) -> Summary:
 
 
 class RunCheckpoints:
-    """The state of each method after its last iteration, in `out`/checkpoints, in files that are
-    written atomically.
+    """The state of each method after its last iteration, in atomically written files in
+    `out`/checkpoints.
     """
 
     def __init__(self, plan: LearnPlan) -> None:
-        """Begin a run, or continue one with the same settings; raises `ConfigError` as `learn`
+        """Begin a run, or continue a run with the same settings; raises `ConfigError` as `learn`
         does.
         """
         self._folder = plan.out / "checkpoints"
@@ -144,13 +144,13 @@ class RunCheckpoints:
             )
 
     def save(self, name: str, state: Mapping[str, Any]) -> None:
-        """Write the state of a method; if that fails, the last one is kept."""
+        """Write the state of a method. If writing fails, the previous state is kept."""
         part = self._folder / f"{name}.part"
         torch.save(dict(state), part)
         part.replace(self._folder / f"{name}.pt")
 
     def load(self, name: str) -> dict[str, Any] | None:
-        """Read the state of a method; None if there is none yet."""
+        """Read the state of a method; None if no state is saved yet."""
         file = self._folder / f"{name}.pt"
         if not file.is_file():
             return None
@@ -159,11 +159,11 @@ class RunCheckpoints:
 
 
 class LearnRun:
-    """A run with the servers of the students and of their teacher."""
+    """A run with the servers of the students and of the teacher."""
 
     def __init__(self, plan: LearnPlan, checkpoints: RunCheckpoints) -> None:
         self._plan, self._checkpoints = plan, checkpoints
-        # Checkpoints of learners, by the student that they train.
+        # Checkpoints of learners, by the student that a learner trains.
         self._clones: dict[str, dict[str, Any]] = {}
 
     def summary(self) -> Summary:
@@ -242,7 +242,10 @@ class LearnRun:
     def _played(
         self, weights: Publisher, learner: NetworkLearner, play: Callable[[], Played]
     ) -> Played:
-        """Play with the learner's weights; push them again if the replica was restarted."""
+        """Run episodes with the learner's weights.
+
+        The weights are pushed again if the replica was restarted.
+        """
         failures = 0
         while True:
             try:
@@ -317,17 +320,17 @@ def main(
     ] = None,
     out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Of the networks and of the training's episodes.")
+        int | None, typer.Option(help="Seed of the networks and of the training episodes.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with what is in --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")] = False,
     track: Annotated[
         str, typer.Option(help="Show success rates in: wandb, trackio, tensorboard.")
     ] = "",
     changes: SetInFile = [],  # noqa: B006
     config_dir: ConfigDir = None,
 ) -> None:
-    """Train a small policy to lift pucks: from demonstrations, with a teacher's advice, and
-    alone.
+    """Train a small policy to lift pucks: from demonstrations, with a teacher's advice, and without
+    advice.
     """
     given = {
         "out": out_dir,

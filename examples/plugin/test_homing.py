@@ -13,7 +13,7 @@ from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.testing import check_agent
 
 OBS = Obs(state={"joints": np.ones(3, np.float32)})
-ACTION = -0.1 * np.ones(3)  # of the policy for that observation
+ACTION = -0.1 * np.ones(3)  # the policy's actions for this observation
 
 
 def test_the_policy_is_registered_and_keeps_its_contract():

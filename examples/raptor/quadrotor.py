@@ -1,7 +1,7 @@
-"""Simulated quadrotors of random size, mass, motors and disturbance, which have to come to a target
-and hover there.
+"""Simulated quadrotors of random size, mass, motors and disturbance, which must fly to a target and
+hover there.
 
-Dynamics, distribution and conventions are those of the training of RAPTOR
+Dynamics, distribution and conventions are the same as in the training of RAPTOR
 (https://arxiv.org/abs/2509.11481) in https://github.com/rl-tools/rl-tools, commit cda0a54e:
 include/rl_tools/rl/environments/l2f/operations_generic and
 src/foundation_policy/pre_training/sample_dynamics_parameters.cpp. `python quadrotor.py` checks the
@@ -17,17 +17,18 @@ from vlagents_ray.testing import check_env
 
 DT = 0.01  # s
 GRAVITY = 9.81  # m/s²
-# The distribution scales the Crazyflie: thrust of a rotor as a polynomial in its speed in [0, 1],
-# here as a share of the largest thrust; moments of inertia about x, y and z, here in units of the
-# first; distance of the rotors from the body's x and y axes, m; mass, kg.
+# The distribution scales the values of the Crazyflie: the thrust of a rotor as a polynomial in its
+# speed in [0, 1], here as a share of the largest thrust; the moments of inertia about x, y and z,
+# here in units of the first; the distance of the rotors from the body's x and y axes, m; and the
+# mass, kg.
 THRUST = np.array([0.00352526, 0.01437313, 0.09223048]) / 0.11012887
 INERTIA = np.array([9.416556729130406, 9.644051701582312, 17.45951732253285]) / 9.416556729130406
 ARM, MASS = 0.028, 0.0306
-# A flight ends as one of the training does, beyond 20 times the distance of the rotors from the
-# centre or 35 rad/s, but not beyond 2 m/s: quadrotors of all sizes begin with up to 1 m/s in each
-# direction, tilted and with slow rotors.
+# As in the training, a flight ends beyond 20 times the distance of the rotors from the centre, or
+# beyond 35 rad/s. The training's limit of 2 m/s is not used, since quadrotors of all sizes begin
+# with up to 1 m/s in each direction, tilted and with slow rotors.
 FARTHEST, LARGEST_RATE = 20, 35.0
-HOVER_M, HOVER_STEPS = 0.2, 100  # the success: within this distance of the target for 1 s
+HOVER_M, HOVER_STEPS = 0.2, 100  # success: within this distance of the target for 1 s
 
 
 def sample(rng):
@@ -40,29 +41,30 @@ def sample(rng):
         The quadrotor, its values by name, and the state of `Quadrotors`, (17,).
     """
     thrust_to_weight = rng.uniform(1.5, 5.0)
-    mass = rng.uniform(np.cbrt(0.02), np.cbrt(5.0)) ** 3  # kg; uniform in size
-    deviation = rng.normal(-0.1, 0.1)  # the source has this mean, the lower end of its range
+    mass = rng.uniform(np.cbrt(0.02), np.cbrt(5.0)) ** 3  # kg; the size is uniformly distributed
+    deviation = rng.normal(-0.1, 0.1)  # the source also uses the lower end of the range as the mean
     arm = ARM * np.cbrt(mass / MASS) * (1 / (1 - deviation) if deviation < 0 else 1 + deviation)
-    thrust = thrust_to_weight * mass * GRAVITY / 4  # N, of one rotor
+    thrust = thrust_to_weight * mass * GRAVITY / 4  # largest thrust of one rotor, N
     quadrotor = {
         "mass": mass,
         "arm": arm,
         "thrust": thrust,
-        # Kg m² about x, by the torque, rad/s².
+        # Moment of inertia about x, kg m², from the torque and a random acceleration, rad/s².
         "inertia": np.sqrt(2) * arm * thrust / rng.uniform(40.0, 1200.0),
-        "torque_constant": rng.uniform(0.005, 0.05),  # m, torque of a rotor about z by its thrust
-        "rising": rng.uniform(0.03, 0.10),  # s, time constant of the motors when they accelerate
-        "falling": rng.uniform(0.03, 0.30),  # s
+        # Torque of a rotor about z divided by its thrust, m.
+        "torque_constant": rng.uniform(0.005, 0.05),
+        "rising": rng.uniform(0.03, 0.10),  # time constant of accelerating motors, s
+        "falling": rng.uniform(0.03, 0.30),  # time constant of decelerating motors, s
     }
     spread = rng.uniform(0, 0.3 * (thrust_to_weight - 1)) * thrust_to_weight * mass / 3
-    # N.
+    # Force of the disturbance along each axis, N.
     quadrotor |= {
         f"force_{axis}": force for axis, force in zip("xyz", rng.normal(0, spread, 3), strict=True)
     }
     state = np.zeros(17)
     state[3] = 1.0
     state[13:] = rng.uniform(0, 0.5, 4)
-    if rng.uniform() >= 0.1:  # a tenth of the flights begin at the target and at rest
+    if rng.uniform() >= 0.1:  # One tenth of the flights begin at the target and at rest.
         state[:3] = rng.uniform(-1, 1, 3) * 10 * np.sqrt(2) * arm
         axis, angle = rng.normal(size=3), rng.uniform(0, 1)  # rad
         state[3:7] = [np.cos(angle / 2), *np.sin(angle / 2) * axis / np.linalg.norm(axis)]
@@ -71,13 +73,13 @@ def sample(rng):
 
 
 class Quadrotors:
-    """N quadrotors that fly at the same time, each as if it were alone: all arithmetic is by
-    element.
+    """N quadrotors that fly at the same time without affecting each other, since all arithmetic is
+    elementwise.
 
     Attributes:
         state: (17, N), the position, m; the orientation, a quaternion wxyz; the velocity, m/s; the
             angular velocity in the body's axes, rad/s; and the speeds of the rotors in [0, 1].
-        action: (4, N), the last action; at first the one that holds the rotors' speeds.
+        action: (4, N), the last action; initially, the action that keeps the rotors' speeds.
         parameters: The values of the quadrotors by name, each (N,), in the units of `sample`.
     """
 
@@ -89,13 +91,14 @@ class Quadrotors:
         }
         self.state = np.stack([state for _, state in drawn], axis=1)
         self.action = 2 * self.state[13:] - 1
-        # (N,), distance of the rotors from the centre, m.
+        # Distance of the rotors from the centre, (N,) m.
         self.radius = np.sqrt(2) * self.parameters["arm"]
 
     def step(self, action, flying=True):
-        """Fly for `DT` with an action, (4, N), which sets the rotors' speeds: -1 is 0 and 1 is 1.
+        """Fly for `DT` with an action, (4, N), which sets the rotors' speeds: -1 means speed 0, and
+        1 means speed 1.
 
-        Quadrotors that are not `flying`, (N,) bool, stay as they are.
+        Quadrotors that are not `flying`, (N,) bool, do not change.
         """
         self.action = np.where(flying, action, self.action)
         command = (np.clip(self.action, -1, 1) + 1) / 2
@@ -168,10 +171,10 @@ class Quadrotors:
 
 
 class HoverBatch(BatchEnv):
-    """Flights of 5 s at the same time: come to the target, and stay there."""
+    """Simultaneous flights of 5 s, in which quadrotors fly to the target and stay there."""
 
     max_steps = 500
-    contract = Contract(  # the conventions of https://pypi.org/project/foundation-policy
+    contract = Contract(  # conventions of https://pypi.org/project/foundation-policy
         state={
             "position": StateSpec(3, "m"),
             "rotation": StateSpec(9),
@@ -196,7 +199,7 @@ class HoverBatch(BatchEnv):
         return self._observe()
 
     def step(self, acts):
-        """Fly for 10 ms; the reward is the distance to the target, negative, m."""
+        """Fly for 10 ms. The reward is the negative distance to the target, m."""
         flying = np.array([act is not None for act in acts])
         rows = [np.zeros(4) if act is None else one_row(act, self.contract) for act in acts]
         self.flights.step(np.stack(rows, axis=1), flying)
@@ -225,7 +228,7 @@ class HoverBatch(BatchEnv):
 
 
 class Hover(EvalEnv):
-    """One such flight."""
+    """A single flight of `HoverBatch`."""
 
     max_steps = HoverBatch.max_steps
     contract = HoverBatch.contract
@@ -250,5 +253,5 @@ class Hover(EvalEnv):
 
 
 if __name__ == "__main__":
-    check_env(Hover())  # raises what is wrong with it
+    check_env(Hover())  # raises an error that lists all problems
     print("Hover keeps its contract")

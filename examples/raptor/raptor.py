@@ -1,5 +1,5 @@
-"""Serve RAPTOR (https://arxiv.org/abs/2509.11481), a recurrent policy that flies quadrotors it has
-never seen.
+"""Serve RAPTOR (https://arxiv.org/abs/2509.11481), a recurrent policy that can fly quadrotors that
+were not in its training.
 
 Its trained weights are on PyPI: `pip install foundation-policy==1.0.2` (MIT). In this folder
 `vlagents-ray serve raptor.yaml` serves it, and `vlagents-ray eval flights.yaml` flies 500
@@ -14,11 +14,12 @@ from vlagents_ray import Act, ActionSpec, Contract, StateSpec, TrainableAgent
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.registry import require
 
-INPUTS = {  # in the order of the network's 22 inputs
-    "position": StateSpec(3, "m"),  # from the target; x forward, y left, z up
-    "rotation": StateSpec(9),  # from the body's axes to the world's, a matrix row by row
+INPUTS = {  # parts of the state, in the order of the network's 22 inputs
+    "position": StateSpec(3, "m"),  # position relative to the target; x forward, y left, z up
+    # Rotation matrix from the body's axes to the world's axes, row by row.
+    "rotation": StateSpec(9),
     "velocity": StateSpec(3, "m/s"),
-    "angular_velocity": StateSpec(3, "rad/s"),  # in the body's axes
+    "angular_velocity": StateSpec(3, "rad/s"),  # angular velocity in the body's axes
     "previous_action": StateSpec(4),
 }
 
@@ -29,8 +30,8 @@ class Raptor(TrainableAgent):
     """
 
     trainable = "weights"
-    # A resumed session gets its last 128 observations again: the GRU forgets earlier ones, and acts
-    # as before to 3e-7.
+    # A resumed session receives its last 128 observations again. The GRU forgets earlier ones, so
+    # that its actions are equal up to 3e-7.
     contract = Contract(
         state=INPUTS, action=ActionSpec(dim=4, space="rotor_speed"), control_hz=100.0, history=129
     )

@@ -1,6 +1,7 @@
-"""Writes the card of a reference policy: `python examples/reference/card.py CHECKPOINT EVALUATION...`.
+"""Writes the model card of a reference policy: `python examples/reference/card.py CHECKPOINT
+EVALUATION...`.
 
-It states the data, the seeds, the commit, the rates of success with their intervals, and the
+The card contains the data, the seeds, the commit, the success rates with their intervals, and the
 limits.
 """
 
@@ -62,8 +63,9 @@ MADE = "training.json"
 
 
 def rates(results: Sequence[Results]) -> list[str]:
-    """Return the rows of the table of rates, a task each; `misled` is the control, told of other
-    things.
+    """Return the rows of the table of rates, one for each task.
+
+    `misled` is the control with wrong instructions.
     """
     cases = {(case.policy, case.env): case for one in results for case in one.cases}
     lines = ["| task | success, % | misled, % | seeds |", "|---|---|---|---|"]
@@ -83,8 +85,8 @@ def _rate(case: CaseResults) -> str:
 
 
 def main(checkpoint: Path, evaluations: list[Path]) -> None:
-    """Write README.md, and rates.json: the solved ones and all episodes of each task, into the
-    folder.
+    """Write README.md into the folder, and rates.json with the numbers of solved and of all
+    episodes of each task.
     """
     results = [Results.load(folder) for folder in evaluations]
     stated, trained = read_checkpoint(checkpoint), json.loads((checkpoint / MADE).read_text())

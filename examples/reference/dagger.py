@@ -1,11 +1,11 @@
-"""Record an expert's corrections of the reference policy, or its demonstrations alone.
+"""Record an expert's corrections of the reference policy, or only the expert's demonstrations.
 
 Options: `python examples/reference/dagger.py record --help`, and `demonstrate --help`.
 
-The policy runs the tabletop until the expert takes over, at a tick drawn by the seed, as soon as
-the gripper is open, so that it drops nothing. What it then shows are states that the policy reaches
-(DAgger, arXiv 1011.0686; with an expert that takes over: HG-DAgger, arXiv 1810.02890). Episodes
-that the policy solves before are not recorded.
+The policy controls the tabletop until the expert takes over, at the first tick with an open gripper
+after a random tick, so that nothing is dropped. The expert's actions then begin in states that the
+policy reaches (DAgger, arXiv 1011.0686; with an expert that takes over: HG-DAgger, arXiv
+1810.02890). Episodes that the policy solves before the takeover are not recorded.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from vlagents_ray.interface import Act
 from vlagents_ray.policies.experts.tabletop import TabletopExpert
 from vlagents_ray.policies.reference import Reference
 
-TAKE_OVER = 20  # ticks within which the expert may; an episode of a success has 31
+TAKE_OVER = 20  # ticks within which the expert may take over; a successful episode has 31
 OPEN = 0.9  # opening of a gripper that holds nothing
-EXECUTE = 4  # rows of a chunk, as in the evaluation
+EXECUTE = 4  # executed rows of a chunk, as in the evaluation
 HZ = 20  # rate of the tabletop
-# Pushes aside in demonstrations, in turn: those of demonstrations/tabletop.yaml.
+# Disturbances of the demonstrations, in alternation, as in demonstrations/tabletop.yaml.
 DISTURBANCES = (0.5, 1.0)
 app = typer.Typer(pretty_exceptions_enable=False)
 
 
 def correct(env: EvalEnv, policy: Reference, dataset: Dataset, seed: int) -> bool:
-    """Play an episode, and keep it if the expert solved it; returns whether it did."""
+    """Run an episode, and keep it if the expert solved it. Return whether the episode was kept."""
     obs, _ = env.reset(seed=seed)
     policy.reset(obs, env.instruction, seed=seed)
     expert, due, rows = (
@@ -85,7 +85,7 @@ def demonstrate_episode(env: EvalEnv, dataset: Dataset, seed: int) -> bool:
     for tick in range(env.max_steps):
         try:
             action = expert.act(obs).action
-        except InvalidObservation:  # the gripper hides an object
+        except InvalidObservation:  # The gripper hides an object.
             break
         episode.add(obs, action, tick / HZ, tick, False)
         obs, _, _, _, info = env.step(Act(action))
@@ -106,10 +106,10 @@ def record(
     out: Annotated[Path, typer.Argument(help="New folder of a LeRobotDataset with interventions.")],
     episodes: Annotated[int, typer.Option(min=1, help="That are played.")] = 800,
     seed: Annotated[
-        int, typer.Option(help="Of the first one; those of the evaluation begin at 0.")
+        int, typer.Option(help="Seed of the first episode; seeds of the evaluation begin at 0.")
     ] = 2_000_000,
 ) -> None:
-    """Record corrections, losslessly, as the policy gets images without loss."""
+    """Record corrections, without loss, since the policy receives images without loss."""
     policy = Reference.from_config(
         {"checkpoint": str(checkpoint), "embodiment": "tabletop", "execute": EXECUTE}
     )
@@ -129,10 +129,13 @@ def demonstrate(
         int, typer.Option(help="Seed of the first episode; seeds of the evaluation begin at 0.")
     ] = 3_000_000,
     lossless: Annotated[
-        bool, typer.Option(help="Keep each pixel. H.264 is lossy, as in usual datasets.")
+        bool,
+        typer.Option(
+            help="Keep each pixel. The default is H.264, which is lossy, as in usual datasets."
+        ),
     ] = True,
 ) -> None:
-    """Record demonstrations of the expert alone, with pushes aside as in the first training."""
+    """Record demonstrations of the expert, with disturbances as in the first training."""
     begun = time.monotonic()
     kept = 0
     dataset = Dataset(out, HZ, lossless=lossless, durable=False)
@@ -157,9 +160,11 @@ def demonstrate(
 
 @app.command("compare")
 def compare_after(
-    out: Annotated[Path, typer.Argument(help="Results of before and after, on the same seeds.")],
+    out: Annotated[
+        Path, typer.Argument(help="Results before and after the training, on the same seeds.")
+    ],
 ) -> None:
-    """Print the paired comparison of an evaluation, by McNemar's exact test."""
+    """Print the paired comparison of an evaluation, with McNemar's exact test."""
     total = compare(Results.load(out), "after", "before").total
     pairs, (low, high) = total.pairs, total.interval
     typer.echo(

@@ -1,4 +1,4 @@
-"""A control for the reference policy: it is told of other things than its task's."""
+"""A control for the reference policy, which receives the instruction of another task."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ _DEEDS = {
 
 
 class Misled(Reference):
-    """The reference policy, whose instruction names the next colour for each, or another deed."""
+    """The reference policy with a wrong instruction: each colour is replaced with another
+    colour, or the task with another task.
+    """
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
         other = _DEEDS.get(instruction) or " ".join(

@@ -2,9 +2,9 @@
 
 Options: `python examples/reference/train.py --help`.
 
-An interrupted run continues where its last state was kept, and ends with the same weights: each
-batch, and its noise, follow from the seed and the number of the step. So does a second run, on the
-same processor, with the same torch and as many threads.
+An interrupted run continues from its last saved state, and ends with the same weights, since each
+batch and its noise follow from the seed and the number of the step. A second run also ends with the
+same weights, on the same processor, with the same version of torch and the same number of threads.
 """
 
 from __future__ import annotations
@@ -44,24 +44,28 @@ from vlagents_ray.ray_tools.git_state import code_in
 from vlagents_ray.recorded_dataset import Names, RecordedDataset
 from vlagents_ray.weights.safetensors import write_values
 
-BATCH = 256  # frames
-# Times that a frame's context is used in a step, each with noise of its own: they cost little.
+BATCH = 256  # frames per batch
+# The number of times that a frame's context is used in a step, each time with other noise, which
+# takes little time.
 DRAWS = 4
-RATE, DECAY, CLIP = 3e-3, 0.01, 1.0  # of AdamW from nothing, and the largest norm of a gradient
-WARM_UP = 200  # steps, after which the rate falls as a cosine
-# Weight of the error of the places of objects, which teaches early what words mean in images.
+# Learning rate and weight decay of AdamW without a start checkpoint, and largest norm of a
+# gradient.
+RATE, DECAY, CLIP = 3e-3, 0.01, 1.0
+WARM_UP = 200  # number of steps after which the learning rate falls as a cosine
+# The weight of the error of object positions. This error teaches the network early which words
+# belong to which objects in images.
 OBJECTS = 1.0
-AVERAGE = 0.999  # average of the weights, per step; these are what is saved
+AVERAGE = 0.999  # decay per step of the average of the weights, which is saved
 MADE = "training.json"
-KEEP_EVERY = 500  # steps between two kept states
-SHOWN_EVERY = 100  # steps between two lines of the log
+KEEP_EVERY = 500  # number of steps between two saved states
+SHOWN_EVERY = 100  # number of steps between two lines of the log
 
 
 def computing_dtype() -> torch.dtype:
-    """Return the type of the numbers that a step computes with; the optimizer has float32.
+    """Return the type with which a step computes. The optimizer always uses float32.
 
-    It is bfloat16 on a processor with AVX-512. On one with AVX2 alone, PyTorch took 57 times as
-    long for a product of matrices in bfloat16 as in float32 (512 x 256 by 256 x 256).
+    It is bfloat16 on a processor with AVX-512. On a processor with only AVX2, PyTorch took 57 times
+    as long for a product of matrices in bfloat16 as in float32 (512 x 256 by 256 x 256).
     """
     has_bfloat16 = torch.backends.cpu.get_cpu_capability() == "AVX512"
     return torch.bfloat16 if has_bfloat16 else torch.float32
@@ -69,18 +73,20 @@ def computing_dtype() -> torch.dtype:
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of all datasets, in the order of robots and episodes; M of them are trained
-    with.
+    """The N frames of all datasets, in the order of robots and episodes.
+
+    M of them are used for training.
     """
 
     images: np.ndarray  # (M, cameras, S, S, 3) uint8
-    place: torch.Tensor  # (M,) int64, of each among all N
+    place: torch.Tensor  # index of each training frame among all N frames, (M,) int64
     state: torch.Tensor  # (N, S) in the network's units
-    # (N, O) places of objects, of mean 0 and variance 1; NaN where a robot's dataset has none.
+    # The positions of objects with mean 0 and variance 1, (N, O); NaN where a robot's dataset has
+    # none.
     objects: torch.Tensor
     action: torch.Tensor  # (N, D)
     tokens: torch.Tensor  # (N, L)
-    end: torch.Tensor  # (N,) int64, the first frame after the episode's
+    end: torch.Tensor  # index of the first frame after each frame's episode, (N,) int64
 
 
 def read(
@@ -90,19 +96,20 @@ def read(
     every: int = 1,
     start: Checkpoint | None = None,
 ) -> tuple[Checkpoint, Frames]:
-    """Read the dataset of each robot in a folder; of one with interventions, only these are trained
-    with.
+    """Read the dataset of each robot in a folder.
+
+    From a dataset with interventions, only the interventions are used for training.
 
     Args:
         data: The folder, with a dataset for each robot.
-        cameras: Of the network -> of the robot, by robot.
+        cameras: For each robot, the network's camera -> the robot's camera.
         kept: A file for the decoded images, which may be larger than the memory.
-        every: One frame of so many of an episode is trained with: its neighbours are nearly the
-            same.
-        start: The checkpoint that is trained further, whose words and units stay.
+        every: One of this number of consecutive frames is used for training, since neighbouring
+            frames are nearly the same.
+        start: The checkpoint that is trained further. Its words and units are kept.
 
     Returns:
-        What the checkpoint states, and the frames.
+        The description of the checkpoint, and the frames.
     """
     sizes = NetworkSizes(words=1)
     texts, ends, places = list[str](), list[int](), list[int]()
@@ -176,8 +183,9 @@ def read(
 
 
 def batches(frames: int, seed: int) -> Iterator[np.ndarray]:
-    """Yield the frames of each step, sorted as they are read from a file: all of them once, then
-    again.
+    """Yield the frames of each step, sorted, since they are read from a file.
+
+    All frames are used once before any frame is used again.
     """
     for epoch in range(10**9):
         order = np.random.default_rng([seed, epoch]).permutation(frames)
@@ -187,8 +195,8 @@ def batches(frames: int, seed: int) -> Iterator[np.ndarray]:
 
 
 class Training(torch.nn.Module):  # type: ignore[misc]  # torch's own types are not read
-    """The network, and a guess of the places of objects from its context, which is for the
-    training alone.
+    """The network, with an additional prediction of object positions from its context, which is
+    only used in training.
     """
 
     def __init__(self, sizes: NetworkSizes, objects: int) -> None:
@@ -212,14 +220,14 @@ def loss_of(
     training: Training, frames: Frames, batch: np.ndarray, draws: torch.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the mean squared error of the flow's velocity over a batch, and the error of the
-    places of objects.
+    object positions.
 
-    Times are drawn as for π0 (arXiv 2410.24164), more of them near the noise.
+    Flow times are drawn as for π0 (arXiv 2410.24164), more often near the noise.
 
     Args:
-        training: The network, and the guess, in any floating-point type.
+        training: The network with the additional prediction, in any floating-point type.
         frames: All frames.
-        batch: Those of the batch, (B,) among those that are trained with.
+        batch: The indices of the batch's frames among the training frames, (B,).
         draws: The generator of noise and times.
     """
     index, horizon = frames.place[batch], training.network.sizes.horizon
@@ -249,10 +257,11 @@ def fit(
     rate: float = RATE,
     start: Path | None = None,
 ) -> ReferenceNetwork:
-    """Return the network after so many steps, from the state in the file `kept` if there is one,
-    else from `start`.
+    """Return the network after `steps` steps.
 
-    Each thread has a part of a batch, which is 1.4 times as fast as operations of several threads.
+    The training continues from the state in the file `kept` if there is one, otherwise from
+    `start`. Each thread computes a part of a batch, which is 1.4 times as fast as operations with
+    several threads.
     """
     torch.manual_seed(seed)
     training = Training(checkpoint.sizes, frames.objects.shape[1])
@@ -321,7 +330,7 @@ def fit(
 def save(
     checkpoint: Checkpoint, network: ReferenceNetwork, folder: Path, trained: dict[str, Any]
 ) -> None:
-    """Write a checkpoint; `trained` states how it was made, for its card."""
+    """Write a checkpoint. `trained` describes how it was made, for the model card."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MADE).write_text(json.dumps(trained, indent=1) + "\n")
     (folder / CONFIG).write_text(checkpoint.model_dump_json(indent=1, exclude_none=True) + "\n")
@@ -335,15 +344,17 @@ def main(
     cameras: Annotated[
         list[str], typer.Option(help="ROBOT=SCENE,WRIST: the robot's names of the cameras.")
     ],
-    steps: Annotated[int, typer.Option(min=1, help=f"Of {BATCH} frames each.")] = 11000,
+    steps: Annotated[
+        int, typer.Option(min=1, help=f"Number of steps with {BATCH} frames each.")
+    ] = 11000,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     every: Annotated[
-        int, typer.Option(min=1, help="Of so many frames of an episode, one is trained with.")
+        int, typer.Option(min=1, help="Use one of this number of consecutive frames of an episode.")
     ] = 1,
     threads: Annotated[int, typer.Option(min=1, help="Others round differently.")] = 2,
     start: Annotated[
         Path | None,
-        typer.Option(help="Checkpoint that is trained further, instead of from nothing."),
+        typer.Option(help="Checkpoint that is trained further; default: a new network."),
     ] = None,
     rate: Annotated[float, typer.Option(help="Largest learning rate.")] = RATE,
     work: Annotated[

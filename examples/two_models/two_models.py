@@ -1,14 +1,14 @@
-"""One robot, two models: a slow planner chooses a subtask once a second, and a fast policy moves
+"""A robot with two models: a slow planner chooses a subtask once a second, and a fast policy moves
 the arm ten times a second.
 
-Each model is a deployment with sessions of its own. Both are scripted here, and take the time of
-real ones. In the folder of this file, in two terminals:
+Each model is a deployment with its own sessions. Both models are scripted here, and take as long as
+real models. In the folder of this file, in two terminals:
 
     vlagents-ray serve two_models.yaml
     python two_models.py http://localhost:8000
 
-docs/fleet.md says what happens if one of them is late or down; `vlagents-ray plan fleet.yaml`
-plans the GPUs for twelve such robots.
+docs/fleet.md explains what happens if a model is late or not available. `vlagents-ray plan
+fleet.yaml` plans the GPUs for twelve such robots.
 """
 
 import sys
@@ -31,14 +31,14 @@ from vlagents_ray.robot import RobotWithPlanner, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 
 TASK = "put the cup away"
-SUBTASKS = {  # the pose in which each one is done, rad
+SUBTASKS = {  # subtask -> pose in which it is done, rad
     "reach over the cup": [0.6, 0.3, 0.0],
     "lower the hand": [0.6, 0.3, -0.4],
     "lift the cup": [0.6, 0.6, 0.0],
     "carry it to the shelf": [-0.6, 0.6, 0.0],
 }
-ROWS = 10  # rows of a chunk of the policy
-STEP = 0.06  # rad, that a joint moves in a row
+ROWS = 10  # number of rows of the policy's chunks
+STEP = 0.06  # motion of a joint in a row, rad
 CONTRACT = Contract(
     state={"joints": StateSpec(3, "rad")},
     action=ActionSpec(dim=3, space="joint_position", delta=False),
@@ -46,8 +46,8 @@ CONTRACT = Contract(
 
 
 class Planner(Agent):
-    """Looks whether the subtask is done, and answers with the present one: its words, and its pose
-    as the action.
+    """Checks whether the subtask is done, and answers with the current subtask: its words, and its
+    pose as the action.
     """
 
     contract = CONTRACT
@@ -71,7 +71,7 @@ class Planner(Agent):
 
 
 class Reach(Agent):
-    """Moves all joints towards the pose of the planner, in chunks."""
+    """Moves all joints in chunks towards the planner's pose."""
 
     contract = CONTRACT
 
@@ -90,12 +90,14 @@ class Reach(Agent):
 
 
 def main(url):
-    """Do the task, and print how both models kept up."""
-    arm = SimulatedRobot(CONTRACT)  # of yours: observe() -> Obs, apply(action), stop()
+    """Perform the task, and print how many ticks of both models were in time."""
+    # Replace it with your arm: observe() -> Obs, apply(action), stop().
+    arm = SimulatedRobot(CONTRACT)
     planner = RemoteAgent(f"{url}/planner", timeout_s=5)
     policy = RemoteAgent(f"{url}/policy", timeout_s=5)
     with (
-        # The newest subtask is in each observation. The robot holds while it is older than 3 s.
+        # Each observation contains the newest subtask. The robot holds still while the subtask is
+        # older than 3 s.
         RobotWithPlanner(arm, planner, instruction=TASK, hz=1, max_age_s=3) as robot,
         ChunkPlayer(policy, PlayerSettings(mode="async")) as player,
     ):

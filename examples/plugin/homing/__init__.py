@@ -1,1 +1,1 @@
-"""A policy for vlagents-ray, a part of its server, and a command."""
+"""A plug-in for vlagents-ray with a policy, a part of its server, and a command."""

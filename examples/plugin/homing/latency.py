@@ -1,4 +1,4 @@
-"""A part of a replica: counts the calls of the policy, and answers `GET /homing/latency`."""
+"""A part of a replica, which counts the calls of the policy, and answers `GET /homing/latency`."""
 
 import threading
 

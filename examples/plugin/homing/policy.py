@@ -1,4 +1,4 @@
-"""The policy Homing: moves each joint towards zero."""
+"""The policy Homing, which moves each joint towards zero."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from vlagents_ray import Act, ActionSpec, Agent, Contract, StateSpec
 
 
 class Homing(Agent):
-    """Commands a tenth of the way to zero, for three joints."""
+    """Moves three joints by a tenth of their distance to zero in each call."""
 
     contract = Contract(state={"joints": StateSpec(3, "rad")}, action=ActionSpec(dim=3, delta=True))
 

@@ -1,4 +1,4 @@
-"""What this distribution registers, by the names in the entry points of pyproject.toml.
+"""The registry entries of this distribution, under the names in the entry points of pyproject.toml.
 
 Import nothing large here.
 """
@@ -8,7 +8,8 @@ from vlagents_ray.registry import RegistryEntry
 POLICY = RegistryEntry(
     "homing.policy:Homing",
     about="moves each joint towards zero",
-    # If one of these cannot be imported, `vlagents-ray policies` says which extra brings it.
+    # If one of these modules cannot be imported, `vlagents-ray policies` names the extra that
+    # installs it.
     needs=("numpy",),
     extra="model",
     page="https://example.org/homing",
