@@ -246,9 +246,9 @@ class HasWeightsId(Protocol):
     """{"digest": …, "revision": …}, which identify the weights that `initialize` loaded, and
     further entries for the server's metadata.
 
-    A server reports them, and an evaluation separates results of different digests. If a policy
-    lacks this attribute, the digest is computed from the files that `initialize` found with
-    `vlagents_ray.policies.base.checkpoint.find_checkpoint`.
+    A server reports the digest and the revision, and an evaluation does not mix results with
+    different digests. If a policy lacks this attribute, the digest is computed from the files that
+    `initialize` found with `vlagents_ray.policies.base.checkpoint.find_checkpoint`.
     """
 
 

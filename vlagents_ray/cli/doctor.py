@@ -493,7 +493,7 @@ def triton_compiler(headers: Path) -> Check:
         return Check(
             "warn",
             f"{compiler}, but no {headers}/Python.h",
-            "apt-get install python3-dev, of this version",
+            "apt-get install python3-dev, for this version of Python",
         )
     return Check("ok", compiler)
 

@@ -396,7 +396,8 @@ def _three(text: str) -> list[float]:
 
 
 def _path(actions: np.ndarray, deltas: list[int]) -> np.ndarray:
-    """Return the path of an episode, whose differences are speeds, also for deltas.
+    """Return the path of an episode. The differences of the path are speeds, even if the actions
+    are deltas.
 
     Args:
         actions: The actions of the episode, (T, D).

@@ -235,7 +235,7 @@ class HttpTransport:
         return [Reply(request.request_id, error=error) for request in requests]
 
     def _set_direct(self, address: StreamAddress | None) -> None:
-        """Use the own port of the replica that answered, beginning with the next call."""
+        """Beginning with the next call, use the own port of the replica that answered last."""
         if self._direct is not None:
             self._direct.close()
             self._direct = self._direct_address = None

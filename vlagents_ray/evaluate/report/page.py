@@ -258,7 +258,9 @@ class Latency:
 
     chart: BarChart | None  # the chart; None: no server reported the stages
     stages: list[str]  # the stages that at least one policy reported
-    # (policy id, ms, the env's reset in ms, answers)
+    # (policy id, durations in ms, duration of the env's reset in ms, number of answers); the
+    # durations belong to the stages, to an answer (median and 95th percentile) and to a step of the
+    # env.
     rows: list[tuple[str, list[float | None], float | None, int]]
     transports: list[str]
     timed: int  # number of policy ids with stages; the chart shows the first `MOST_BARS` of them
