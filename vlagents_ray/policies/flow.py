@@ -47,12 +47,30 @@ def follow(velocity: Callable[[Any, float], Any], noise: Any, steps: int, *chang
         steps: The number of steps.
         changes: Functions that are applied to the velocity of each step, in this order.
     """
+
+    def velocity_of_step(actions: Any, step: int) -> Any:
+        return velocity(actions, 1.0 - step / steps)
+
+    return follow_steps(velocity_of_step, noise, steps, *changes)
+
+
+def follow_steps(
+    velocity: Callable[[Any, int], Any], noise: Any, steps: int, *changes: Change
+) -> Any:
+    """Integrate noise (B, H, D) to actions, as `follow` does.
+
+    Args:
+        velocity: Returns the flow's velocity (B, H, D) at noisy actions (B, H, D) and the index of
+            a step, from 0.
+        noise: The actions at time 1.
+        steps: The number of steps.
+        changes: Functions that are applied to the velocity of each step, in this order.
+    """
     actions = noise
     for step in range(steps):
-        time = 1.0 - step / steps
-        taken = velocity(actions, time)
+        taken = velocity(actions, step)
         for change in changes:
-            taken = change(taken, actions, time)
+            taken = change(taken, actions, 1.0 - step / steps)
         actions = actions - taken / steps
     return actions
 
@@ -533,9 +551,8 @@ class FlowPasses(abc.ABC):
             times_of_steps.append(times if frozen is None else times * (1.0 - frozen[..., 0]))
         at_times = self.at_times(torch.stack(times_of_steps, 1))
 
-        def velocity(actions: Any, time: float) -> Any:
+        def velocity(actions: Any, step: int) -> Any:
             """Return the velocity at the flow time of a step."""
-            step = round((1.0 - time) * steps)
             return self._velocity(*constants, actions, at_times[:, step])
 
-        return follow(velocity, noise, steps, *changes)
+        return follow_steps(velocity, noise, steps, *changes)
