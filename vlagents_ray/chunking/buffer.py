@@ -60,7 +60,7 @@ https://arxiv.org/abs/2304.13705) and in `temporal_agg` of their code.
 class Chunk(NamedTuple):
     """A chunk of actions in an answer of the policy."""
 
-    number: int  # 0 for the first chunk of an episode
+    number: int  # index of the chunk in its episode, from 0
     step: int  # `ChunkBuffer.executed` at the chunk's observation: the position of the first row
     rows: np.ndarray  # (H, D) float32
     done: bool = False

@@ -105,7 +105,7 @@ class EaseIn:
         before, self._position = self._position, self._next_position()
         row = int(self._position)
         share = self._position - row
-        if row == int(before):  # before the next row
+        if row == int(before):  # The command is still before the next row.
             command = self._between(action, share)
             command[self._deltas] = (self._position - before) * action[self._deltas]
             return command, 0

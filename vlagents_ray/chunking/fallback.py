@@ -42,7 +42,7 @@ Cause = Literal[
     "leader",  # the operator's device returned no action
     "robot",  # the robot must not move (`holds`), for instance because a camera hangs
     "stopped",  # the robot was stopped and not restarted yet
-    "paused",  # the robot is paused; counted separately
+    "paused",  # the robot is paused; such ticks are counted separately
     "other",  # an agent other than the chunk player gave a safe action
 ]
 

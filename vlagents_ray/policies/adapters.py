@@ -1,11 +1,11 @@
 """LoRA adapters of one network, with a separate adapter for each row of a batch.
 
-The weights of the network remain those of the base. After each linear layer that an adapter
-changes, a hook adds B[i] A[i] x to the layer's result, where i is the adapter of x's row. This
-takes two small products for all rows of the batch, since one tensor contains the A of all adapters
-and another tensor contains the B of all adapters. Adapters of a smaller rank are padded with zeros,
-and rows without an adapter use an adapter of zeros. S-LoRA (arXiv 2311.03285) and Punica (arXiv
-2310.18547) serve language models in this way.
+The weights of the network are not changed. After each linear layer that an adapter changes, a hook
+adds B[i] A[i] x to the layer's result, where i is the adapter of x's row. This takes two small
+products for all rows of the batch, since one tensor contains the A of all adapters and another
+tensor contains the B of all adapters. Adapters of a smaller rank are padded with zeros, and rows
+without an adapter use an adapter of zeros. S-LoRA (arXiv 2311.03285) and Punica (arXiv 2310.18547)
+serve language models in this way.
 """
 
 from __future__ import annotations
@@ -273,7 +273,8 @@ class LoraAdapters:
 def _convolved(module: Any, x: Any, downs: Any, ups: Any, chosen: Any) -> Any:
     """Return the change that the adapter of each entry adds to a convolution's output.
 
-    The entries are the groups of one convolution, whose other settings are those of the module.
+    The entries are the groups of one convolution. Its other settings are the settings of the
+    module.
 
     Args:
         module: The convolution.
@@ -300,7 +301,7 @@ CONFIG, WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
 FILES = (CONFIG, WEIGHTS)
 _PREFIX = "base_model.model."  # prefix of all names in the file
 _DOWN, _UP = ".lora_A.weight", ".lora_B.weight"
-_BASE = ".base_layer."  # in the names of values of a layer with an adapter
+_BASE = ".base_layer."  # part of the names of values in a layer with an adapter
 _LISTED = 5
 # Settings that do not change the effect of a saved LoRA, or that are used below. All other settings
 # must be unset: they select other methods, or parts of the fine-tune that are not a low-rank change

@@ -459,7 +459,8 @@ def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
 
 
 def proxies_now(client: Any) -> list[Any]:
-    """Return the refs of Serve's current proxies, which may have replaced those from `start_serve`.
+    """Return the refs of Serve's current proxies, which may have replaced the proxies from
+    `start_serve`.
 
     `serve.status` reports that a proxy failed, but not the reason.
     """

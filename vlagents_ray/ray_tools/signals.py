@@ -19,7 +19,7 @@ _RAISE_AGAIN_S = 5.0  # time for a call to end after an interrupt, with its own 
 _POLL_S = 0.02  # period of `StopRequest.wait`
 # The signals whose handlers end a command or restart a robot.
 _DELIVERED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
-_WAKE = signal.SIGURG  # ignored by default
+_WAKE = signal.SIGURG  # a signal that processes ignore by default
 
 
 class StopRequest:
@@ -80,7 +80,7 @@ class _Waker:
 
     def __init__(self) -> None:
         self._main = threading.get_ident()
-        self._woken = 0  # how often the main thread has run `_on_wake`
+        self._woken = 0  # number of times that the main thread has run `_on_wake`
         self._ended = threading.Event()
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._writer, False)
@@ -121,8 +121,8 @@ class _Waker:
             waker._close_pipe()
 
     def look(self) -> None:
-        """Let the thread look at the running call."""
-        with contextlib.suppress(BlockingIOError):  # it will look in any case
+        """Make the thread check the running call."""
+        with contextlib.suppress(BlockingIOError):  # the thread will check in any case
             os.write(self._writer, bytes([signal.SIGINT]))
 
     def _close_pipe(self) -> None:
@@ -164,7 +164,7 @@ class _Process:
 
     def __init__(self) -> None:
         self.interrupted = StopRequest()  # within `interrupts`
-        self.stop: StopRequest | None = None  # of the innermost `stop_signals`
+        self.stop: StopRequest | None = None  # flag of the innermost `stop_signals`
         self.call: _RaisingCall | None = None
         self.waker: _Waker | None = None
 
@@ -322,7 +322,7 @@ def raised_at_once(stopping_s: float = 0.0) -> Iterator[None]:
     try:
         for number in handlers:
             signal.signal(number, on_signal)
-        # A signal that arrived before these handlers has only set the flag.
+        # A signal that arrived before these handlers were installed has only set the flag.
         if is_stopping():
             if not stopping_s:
                 raise KeyboardInterrupt

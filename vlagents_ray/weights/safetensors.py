@@ -34,7 +34,7 @@ _DIGITS = 15  # most digits of a number in the header
 _METADATA = "__metadata__"  # the only name in a header that is not the name of a value
 _TYPES = {
     "BOOL": np.dtype(np.bool_),
-    "BF16": np.dtype("V2"),  # see `vlagents_ray.weights.trainable.portable`
+    "BF16": np.dtype("V2"),  # a bfloat16, see `vlagents_ray.weights.trainable.portable`
     **{f"F{8 * size}": np.dtype(f"<f{size}") for size in (2, 4, 8)},
     **{f"I{8 * size}": np.dtype(f"<i{size}") for size in (1, 2, 4, 8)},
     **{f"U{8 * size}": np.dtype(f"<u{size}") for size in (1, 2, 4, 8)},

@@ -48,7 +48,7 @@ class ValueView:
     dtype: str  # name of a torch dtype: "float32", "bfloat16", …
     begin: int  # index of the first element in the storage
     shape: tuple[int, ...]
-    stride: tuple[int, ...]  # elements
+    stride: tuple[int, ...]  # strides, elements
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,9 +109,9 @@ class Publisher(AbstractContextManager["Publisher"]):
         """Push new weights to the policy, and return their version once all replicas have them.
 
         Args:
-            values: The values by the names of `Trainable.parameters`: numpy or JAX arrays or torch
-                tensors, e.g. a `state_dict`. They are copied before this returns, so that the
-                learner can continue.
+            values: The values under the names of `Trainable.parameters`: numpy or JAX arrays or
+                torch tensors, e.g. a `state_dict`. They are copied before this method returns, so
+                that the learner can continue.
             mode: When sessions that follow the newest version change to it: at their next reset
                 ("next_episode"), or between two calls of the policy ("keep"). Robots follow only if
                 they reset with `weights="follow"`.
@@ -131,7 +131,7 @@ class Publisher(AbstractContextManager["Publisher"]):
             UnchangedWeights: The values are equal to the values of the policy.
             InvalidInput: The version is not above the newest one.
             NotTrainable: The policy names no parameters to train.
-            Overloaded: Another push is under way.
+            Overloaded: Another push is in progress.
             PolicyUnavailable: A replica cannot be reached; nothing was changed.
             Forbidden: The API key lacks the scope "weights".
             ConfigError: The server does not accept weights, since it lacks this package.

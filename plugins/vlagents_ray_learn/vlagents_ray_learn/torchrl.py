@@ -9,7 +9,7 @@ an `MPTransport` uses this server after two more lines:
 `ServedPolicy` is the module that TorchRL's collectors call; docs/evaluation/torchrl.md has an
 example.
 
-The keys of tensordicts are those of `torchrl.data.vla`: the image is the camera "front", and the
+The keys of tensordicts are defined in `torchrl.data.vla`: the image is the camera "front", and the
 state is `state["state"]` of an observation.
 """
 

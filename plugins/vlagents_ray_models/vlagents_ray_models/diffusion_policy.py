@@ -507,7 +507,7 @@ def _replace_branches_on_values(module: Any, device: Any) -> None:
     torch = require("torch")
     transforms = require("torchvision.transforms")
     for layer in module.modules():
-        if isinstance(layer, transforms.Normalize):  # it checks for a std of 0
+        if isinstance(layer, transforms.Normalize):  # the transform checks for a std of 0
             mean = torch.tensor(layer.mean, device=device).view(-1, 1, 1)
             std = torch.tensor(layer.std, device=device).view(-1, 1, 1)
             layer.forward = partial(_normalised, mean, std)

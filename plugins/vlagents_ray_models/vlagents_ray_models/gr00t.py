@@ -142,7 +142,7 @@ def _read_processor(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise ConfigError(
-            f"checkpoint {folder}: {CONFIG} and {STATISTICS} are not those of GR00T's "
+            f"checkpoint {folder}: {CONFIG} and {STATISTICS} are not files of GR00T's "
             f"processor ({type(error).__name__}: {error}); {_CURE}"
         ) from error
     return settings, statistics

@@ -282,7 +282,7 @@ class Octo(ModelPolicy):
 def _action_spec(dim: int, dataset: str | None) -> ActionSpec:
     """Describe the actions of a pretraining dataset, which have a standard form.
 
-    The form is that of octo/data/oxe: the change of the end effector's position and of its roll,
+    The form is defined in octo/data/oxe: the change of the end effector's position and of its roll,
     pitch and yaw, then the gripper, 1 = open. Fine-tuned checkpoints do not declare the form of
     their actions.
     """

@@ -160,8 +160,8 @@ class Transforms:
     `create_trained_policy`.
     """
 
-    # Converts a dict of unbatched arrays to the model's inputs; `outputs` and `forward` also
-    # convert dicts.
+    # A transform from a dict of unbatched arrays to the model's inputs. `outputs` and `forward` are
+    # also transforms of dicts.
     inputs: Any
     outputs: Any
     forward: Any  # part of `inputs` that converts actions, before the model's own transforms
@@ -582,7 +582,7 @@ class JaxFlow(OpenPiModel):
         if len(encoded[0]) < len(owners):
             encoded = self._gather(encoded, owners)
         actions = self._follow(self.trained, encoded, noise, device_guide)
-        return np.asarray(actions, np.float32), {}  # this waits for the device
+        return np.asarray(actions, np.float32), {}  # the conversion waits for the device
 
 
 class JaxTokens(OpenPiModel):

@@ -90,7 +90,7 @@ class Prediction:
     mean: np.ndarray | None = None  # mean of the model's distribution, (H, D)
     std: np.ndarray | None = None  # standard deviation, (H, D)
     behaviour: dict[str, Any] = field(default_factory=dict)  # a value for each name of `Row.want`
-    info: dict[str, Any] = field(default_factory=dict)  # for `Act.info`
+    info: dict[str, Any] = field(default_factory=dict)  # entries for `Act.info`
 
 
 @dataclass(slots=True)

@@ -36,10 +36,10 @@ def code_of_class(target: str) -> Program:
     """Return the digests of the module of a class, and of all modules that it imports.
 
     Modules that are imported indirectly are included. They are found as Python's `import` would
-    find them, but nothing is imported: import statements are read from the source, including those
-    in functions. Installed packages and the standard library are not included. A class in an
-    installed package is identified by the version of its distribution. A class of this package has
-    no entry.
+    find them, but nothing is imported: import statements are read from the source, including import
+    statements in functions. Installed packages and the standard library are not included. A class
+    in an installed package is identified by the version of its distribution. A class of this
+    package has no entry.
 
     Args:
         target: "module:Class" or "module".

@@ -29,7 +29,7 @@ class StagedRow(dict[str, np.ndarray]):
     def __init__(self, arrays: Mapping[str, np.ndarray]) -> None:
         super().__init__({name: np.asarray(array, order="C") for name, array in arrays.items()})
         self.block: Any = None  # the copy on the device, (bytes,) uint8
-        self.copied: Any = None  # on a GPU, the event at the end of the copy
+        self.copied: Any = None  # event at the end of the copy, on a GPU
 
     def __reduce__(self) -> tuple[type[StagedRow], tuple[dict[str, np.ndarray]]]:
         return StagedRow, (dict(self),)

@@ -237,7 +237,7 @@ class FlowSampler(Sampler):
     """
 
     batched = True
-    noise_level = 0.0  # as for `RandomSteps`
+    noise_level = 0.0  # noise level of `RandomSteps`
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
