@@ -202,7 +202,7 @@ class LoraAdapters:
         return list(self._values)[(number + 1) % len(self._values)]
 
     def require(self, fingerprint: str) -> str:
-        """Return the fingerprint if its adapter is loaded.
+        """Return a fingerprint if the adapter with this fingerprint is loaded.
 
         Raises:
             UnknownSession: The adapter of a moved session is not loaded in this replica.

@@ -371,7 +371,7 @@ class Compilation:
         self.rows_of_regions: int | None = None
         self.sizes: list[int] = []  # batch sizes for which a core is compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made
-        self.scope: Scope = "all"  # the cores that are being made
+        self.scope: Scope = "all"  # cores whose programs are being made
         # Batch sizes for which the programs of cores with parts are not made yet, from the largest
         # to the smallest.
         self.deferred: list[int] = []

@@ -753,7 +753,7 @@ class Network:
             if self.observed_length(name) < 0 or parts.count(PREVIOUS) > 1:
                 raise ConfigError(
                     f"inputs: {name}: {PREVIOUS} has {len(self.zero_output)} numbers, which do not "
-                    "fit in"
+                    "fit into this input"
                 )
             values = self.zero_output if PREVIOUS in parts else np.zeros(self.observed_length(name))
             conversions.append((f"inputs: {name}", self.options[name].normalized, values))

@@ -239,7 +239,7 @@ class ModelInput:
 
     images: StagedRow
     tokens: list[int]
-    proprio: np.ndarray | None  # (P,) in [-1, 1]
+    proprio: np.ndarray | None  # state vector, (P,) in [-1, 1]
 
 
 class Sequences(NamedTuple):
@@ -248,7 +248,7 @@ class Sequences(NamedTuple):
     """
 
     perceived: Any  # embeddings of images and state, (B, P, D)
-    words: Any  # (B, L, D)
+    words: Any  # embeddings of the words, (B, L, D)
     indices: Any  # indices for `Prismatic.assemble`, (B, T); the actions are the last segment
     lengths: Any  # lengths without padding, (B,)
 
