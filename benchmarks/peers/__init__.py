@@ -149,20 +149,23 @@ PEER_CLIENTS = (
 PEERS = tuple(dict.fromkeys(one.peer for one in PEER_CLIENTS))
 Policy = Mapping[str, float]  # arguments of the peer's `peer.Policy`
 _NO_STATISTICS = "RAY_USAGE_STATS_ENABLED"
+# Without compiled files, an import of Ray Serve takes three times the CPU time, in each process that
+# Serve starts again as it is late: the server never starts on a slow machine.
+_NO_COMPILED_FILES = "PYTHONDONTWRITEBYTECODE"
 # Time limit of a start, s, as some peers import torch, or start Ray, in several processes at once.
 READY_S = 450.0
 
 
 def alone() -> dict[str, str | None]:
     """Return the changes of a peer's environment variables, which remove ours, such as those of a
-    running server's HAProxy.
+    running server's HAProxy, and the one that prevents compiled files.
     """
     ours = [
         name
         for name in os.environ
         if name.startswith(("RAY_", "VLAGENTS_RAY_")) and name != _NO_STATISTICS
     ]
-    return {"PYTHONPATH": "", **dict.fromkeys(ours)}
+    return {"PYTHONPATH": "", **dict.fromkeys((*ours, _NO_COMPILED_FILES))}
 
 
 def peer_clients(

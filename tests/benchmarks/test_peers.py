@@ -4,6 +4,7 @@ that stands in for such a system.
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -282,6 +283,17 @@ def test_a_peer_does_not_get_the_settings_of_our_running_server(
         changes.get(name, "kept") for name in ("RAY_SERVE_ENABLE_HA_PROXY", "VLAGENTS_RAY_HOST")
     ] == [None, None]
     assert "RAY_USAGE_STATS_ENABLED" not in changes
+
+
+def test_a_peer_writes_compiled_files_whatever_the_shell_says() -> None:
+    """Without them, each process of plain Ray Serve started too late, and never caught up."""
+    program = "import os; print(os.environ.get('PYTHONDONTWRITEBYTECODE', 'unset'))"
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **alone()}
+    kept = {name: value for name, value in environment.items() if value is not None}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=kept, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "unset\n"
 
 
 def test_peers_are_named(tmp_path: Path) -> None:
