@@ -149,8 +149,8 @@ PEER_CLIENTS = (
 PEERS = tuple(dict.fromkeys(one.peer for one in PEER_CLIENTS))
 Policy = Mapping[str, float]  # arguments of the peer's `peer.Policy`
 _NO_STATISTICS = "RAY_USAGE_STATS_ENABLED"
-# Without compiled files, an import of Ray Serve takes three times the CPU time, in each process that
-# Serve starts again as it is late: the server never starts on a slow machine.
+# Without compiled files, an import of Ray Serve takes three times the CPU time. Serve ends a proxy
+# that starts late, and the next one is as late, so the server never starts on a slow machine.
 _NO_COMPILED_FILES = "PYTHONDONTWRITEBYTECODE"
 # Time limit of a start, s, as some peers import torch, or start Ray, in several processes at once.
 READY_S = 450.0

@@ -8,6 +8,7 @@ import dataclasses
 import datetime
 import functools
 import inspect
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -120,7 +121,7 @@ def command_of(
     for title, names_of_fields in panels.items():
         for name in names_of_fields:
             hints[name] = _in_panel(hints[name], title)
-    in_order = [name for names_of_fields in panels.values() for name in names_of_fields]
+    in_order = list(itertools.chain.from_iterable(panels.values()))
     fields = sorted(  # arguments, and options that are in no panel, are first
         dataclasses.fields(options),  # type: ignore[arg-type]
         key=lambda field: in_order.index(field.name) if field.name in in_order else -1,
