@@ -59,14 +59,17 @@ FOLDERS = (
     "plugins/vlagents_ray_learn/tests",
 )
 RUN = """#!/bin/bash
-# Measures all that needs a GPU: bash run.sh [OPTIONS of python -m benchmarks.gpu]. The report is in $OUT or build/gpu.
+# Measures all that needs a GPU: bash run.sh [OPTIONS of python -m benchmarks.gpu]. The report is in
+# $OUT or build/gpu.
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 site=$(mktemp -d)
 trap 'rm -rf "$site"' EXIT
 python=${PYTHON:-python3}
-# A folder, and not an environment: torch may itself be in one, which another environment would not see.
-"$python" -m pip install --quiet --no-index --no-deps --no-compile --target "$site" "$here"/wheels/*.whl
+# A folder, and not an environment: torch may itself be in one, which another environment would not
+# see.
+options=(--quiet --no-index --no-deps --no-compile --target "$site")
+"$python" -m pip install "${options[@]}" "$here"/wheels/*.whl
 export OUT=${OUT:-$PWD/build/gpu} PYTHONPATH=$here/repository:$site${PYTHONPATH:+:$PYTHONPATH}
 cd "$here/repository"
 "$python" -m benchmarks.gpu "$@"

@@ -48,7 +48,7 @@ def overview() -> str:
 
 
 def shared_memory() -> str:
-    """Return the picture of a request through shared memory, with the file between the processes."""
+    """Return the picture of a request through shared memory: the file between the processes."""
     client = [("RemoteAgent", "client/transports/shm", _CLIENT)]
     between = [
         ("memory file", "raw pixels, mapped by both", _TRANSPORT),
@@ -92,8 +92,8 @@ def _column(x: int, width: int, label: str, boxes: Sequence[Box], *, rows: int) 
     height = (len(boxes) - 1) * _ROW_HEIGHT + _BOX_HEIGHT
     parts = [
         (
-            f'<rect x="{x - 14}" y="{top - 20}" width="{width + 28}" height="{height + 34}" rx="14" '
-            f'fill="none" stroke="{_LINE}" stroke-width="1.5" stroke-dasharray="5 4"/>'
+            f'<rect x="{x - 14}" y="{top - 20}" width="{width + 28}" height="{height + 34}" '
+            f'rx="14" fill="none" stroke="{_LINE}" stroke-width="1.5" stroke-dasharray="5 4"/>'
         ),
         *_pill(x + width // 2, top - 20, label),
     ]

@@ -26,12 +26,14 @@ tags: [robotics, vision-language-action, flow-matching]
 
 # The reference policy of vlagents-ray
 
-This small vision-language-action policy shows how serving changes the success of a learned policy. It drives simulated
+This small vision-language-action policy shows how serving changes the success of a learned \
+policy. It drives simulated
 grippers only and is not for a real robot.
 
 ## Success
 
-No demonstration was recorded with these seeds. The brackets contain 95 % intervals (Wilson). *Misled* is a control: the
+No demonstration was recorded with these seeds. The brackets contain 95 % intervals (Wilson). \
+*Misled* is a control: the
 instruction names other colours or another task, so that a policy that reads it must fail.
 
 {rates}
@@ -40,7 +42,8 @@ instruction names other colours or another task, so that a policy that reads it 
 
 ## Data
 
-Scripted experts recorded the demonstrations (`examples/reference/demonstrations/`). Failed episodes were left out.
+Scripted experts recorded the demonstrations (`examples/reference/demonstrations/`). Failed \
+episodes were left out.
 
 | robot | episodes | frames | cameras |
 |---|---|---|---|
@@ -48,10 +51,13 @@ Scripted experts recorded the demonstrations (`examples/reference/demonstrations
 
 ## Training
 
-- {steps} steps of {batch} frames out of {trained_frames}; seed {seed}; {threads} threads, {processor}, torch {torch}.
-- {millions:.1f} million parameters in float32, `model.safetensors`; sizes, words and robots are in `config.json`.
+- {steps} steps of {batch} frames out of {trained_frames}; seed {seed}; {threads} threads, \
+{processor}, torch {torch}.
+- {millions:.1f} million parameters in float32, `model.safetensors`; sizes, words and robots are \
+in `config.json`.
 - Code: commit {commit}.
-- `make reference` repeats all steps. On the same kind of processor, a second run gave bit-identical weights.
+- `make reference` repeats all steps. On the same kind of processor, a second run gave \
+bit-identical weights.
 
 ## Limits
 
