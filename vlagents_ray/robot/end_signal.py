@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 from vlagents_ray.ray_tools.signals import delivered
 
-# The signals of systemd and of a closed terminal. Each would end the process at once.
+# The signals of systemd and of a closed terminal, which by default end the process at once.
 END_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
@@ -44,8 +44,8 @@ def ended_by_signals(*numbers: signal.Signals) -> Iterator[EndSignal]:
     """Raise an exception at these signals within the context: `KeyboardInterrupt` at SIGINT,
     otherwise `SystemExit` with the status 128 + the number of the signal.
 
-    Ignored signals (such as SIGHUP under nohup) and the caller's own handlers are unchanged. So are
-    all outside of the main thread, where Python cannot set handlers.
+    Ignored signals (such as SIGHUP under nohup) and the caller's own handlers are unchanged.
+    Outside the main thread, where Python cannot set handlers, no handler is changed.
     """
     end_signal = EndSignal()
     with contextlib.ExitStack() as undo:
