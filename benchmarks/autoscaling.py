@@ -442,7 +442,7 @@ def main(
     ] = 25.0,
     out_file: Out = None,
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw the figures here: .png, .svg or .pdf.")
+        Path | None, typer.Option("--plot", help="File for the picture: .png, .svg or .pdf.")
     ] = None,
 ) -> None:
     """Measure replicas over time while robots and rollouts start and end, from no replica and

@@ -108,7 +108,7 @@ def parse_counts(text: str, option: str) -> list[int]:
         counts = sorted({int(one) for one in parse_list(text)})
     except ValueError as error:
         raise ConfigError(
-            f"{option}: expected numbers with commas between them, got {text!r}"
+            f"{option}: expected numbers that are separated by commas, got {text!r}"
         ) from error
     if not counts or counts[0] < 1:
         raise ConfigError(f"{option}: expected numbers from 1 on, got {text!r}")

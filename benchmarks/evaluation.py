@@ -184,7 +184,7 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
         raise ProcessFailed(
             f"{folder.name}: ran {len(episodes)} episodes with {len(set(seeds))} seeds and "
             f"{sorted(steps)} steps, want each of {plan.episodes} once with {plan.max_steps}; its "
-            "results stand for something else"
+            "results cannot be compared"
         )
     first = min(note.begun for note in episodes)
     playing_s = max(note.ended for note in episodes) - first
@@ -328,7 +328,7 @@ def main(
     ] = 200,
     workers: Annotated[int, typer.Option(min=1)] = 2,
     peers: Annotated[
-        str, typer.Option(help="vlagents, vla-eval, lerobot, with commas between them, or 'all'.")
+        str, typer.Option(help="vlagents, vla-eval, lerobot, separated by commas, or 'all'.")
     ] = "",
     rounds: Annotated[int, typer.Option(min=1)] = 3,
     size: Annotated[

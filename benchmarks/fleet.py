@@ -371,7 +371,7 @@ def parse_kinds(text: str) -> list[Kind]:
 
 def main(
     systems: Annotated[
-        str, typer.Option(help=f"Some of {', '.join(SYSTEMS)}, with commas between them.")
+        str, typer.Option(help=f"Some of {', '.join(SYSTEMS)}, separated by commas.")
     ] = f"{OURS},{TODAY}",
     robots: Annotated[str, typer.Option(help="Numbers of robots.")] = "8,16,32,64",
     kinds: Annotated[

@@ -232,7 +232,7 @@ def main(
     transport: Annotated[str, typer.Option(help="websocket, http or shm.")] = "websocket",
     out_file: Out = None,
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw the curves here: .png, .svg or .pdf.")
+        Path | None, typer.Option("--plot", help="File for the picture: .png, .svg or .pdf.")
     ] = None,
 ) -> None:
     """Measure a fleet of robots, and the cost of a call by the number of sessions and

@@ -138,7 +138,7 @@ def hosts(number: int) -> Iterator[list[Host]]:
         try:
             yield made
         finally:
-            # All hosts are killed at once, as the kernel takes a second or two for each.
+            # All hosts are killed before the first one is awaited, as each takes a second or two.
             for host in made:
                 host._keeper.kill()
 

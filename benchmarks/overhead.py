@@ -148,7 +148,7 @@ def measure_overhead(
                 video="none",
                 out=Path(folder) / str(number),
             )
-            # The name that the cluster's processes have in their environment.
+            # The cluster's processes have this value in their environment.
             with CpuSampler(lambda: marked(os.environ[MARK])) as cpu:
                 evaluate(config)
             playing = steady(recorded(config.out), workers)

@@ -439,7 +439,7 @@ def main(
     page: Annotated[Path, typer.Option(help="The page that is written.")] = Path(
         "docs/measured_tables.md"
     ),
-    file: Annotated[Path, typer.Option("--out", help="Keep the figures here.")] = Path(
+    file: Annotated[Path, typer.Option("--out", help="File for the figures.")] = Path(
         "benchmarks/latest.json"
     ),
     calls: Calls = 1000,

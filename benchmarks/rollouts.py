@@ -301,7 +301,7 @@ def main(
     ] = 64,
     rounds: Annotated[int, typer.Option(min=1)] = 3,
     patience: Annotated[float, typer.Option(help="`batch.patience` of the server.")] = 0.5,
-    size: Annotated[int, typer.Option(help="Pixels a side.")] = 224,
+    size: Annotated[int, typer.Option(help="Width and height of images.")] = 224,
     images: Annotated[bool, typer.Option(help="Whether images are kept.")] = True,
     torchrl: Annotated[
         str,

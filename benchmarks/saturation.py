@@ -36,7 +36,7 @@ ANSWERS = {
         "episodes are handed out by calls from the driver to the actor, which do not pass it"
     ),
     "ServeController": "acts do not pass it: a worker talks to its replica; fewer, larger replicas",
-    "replicas": "replicas grow with the workers; longer chunks, larger batches",
+    "replicas": "the number of replicas grows with the workers; longer chunks, larger batches",
     "head's link": "observations stay on their node; only jobs and results pass",
     "learner's link": (
         "`images=False`; a learner of images takes fewer workers, each on a faster link"
@@ -164,7 +164,7 @@ def main(
     ],
     workers: Annotated[int, typer.Option(min=1)] = 1000,
     steps: Annotated[int, typer.Option(min=1, help="Number of steps of an episode.")] = 250,
-    episode_s: Annotated[float, typer.Option(min=0.1, help="Its length.")] = 30.0,
+    episode_s: Annotated[float, typer.Option(min=0.1, help="Duration of an episode, in s.")] = 30.0,
     chunk: Annotated[
         int, typer.Option(min=1, help="Number of rows in an answer, all of which are executed.")
     ] = 8,

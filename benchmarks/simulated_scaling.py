@@ -79,7 +79,7 @@ class _Report(NamedTuple):
 
 @dataclass(slots=True)
 class _Controller:
-    """Serve's controller, with the delays before a change."""
+    """A simulation of Serve's controller, which delays each change."""
 
     policy: MeasuredLoad
     options: Mapping[str, Any]  # autoscaling options of Serve

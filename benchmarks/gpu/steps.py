@@ -273,7 +273,7 @@ def speed(lab: Lab, mode: bool | str) -> None:
         )
     )
     errors = [row_error(found, eager[name]) for name, found in acts.items() if name in eager]
-    # The difference, or the difference that another batch size makes.
+    # The tolerance of bfloat16, or the error that another batch size causes, if it is larger.
     limit = max(TOLERANCE["bfloat16"], float(eager["rounded"]))
     lab.check("error of compiled acts of other inputs", max(errors), most=limit)
     lab.check(

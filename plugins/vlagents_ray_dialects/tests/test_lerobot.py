@@ -135,7 +135,7 @@ def test_a_mapping_gives_the_policys_names(open_lerobot) -> None:
 def test_policy_instructions_that_do_not_fit_are_refused(open_lerobot) -> None:
     many_images = {f"observation.images.{n}": {"dtype": "image"} for n in range(17)}
     wrong: list[tuple[dict[str, Any], str]] = [
-        ({"checkpoint": "you/pi0"}, "expected 'me/act', for which this server acts"),
+        ({"checkpoint": "you/pi0"}, "expected 'me/act', the checkpoint of this server"),
         ({"rename_map": {"a": "b"}}, "rename_map"),
         ({"actions_per_chunk": 0}, "an integer of 1 or more"),
         (

@@ -129,8 +129,8 @@ class LeRobotConnection(GatewayClient):
         """
         if self._checkpoint not in (None, robot.checkpoint):
             raise InvalidInput(
-                f"pretrained_name_or_path: expected {self._checkpoint!r}, for which this server "
-                f"acts, got {robot.checkpoint[:80]!r}; start the client with the first"
+                f"pretrained_name_or_path: expected {self._checkpoint!r}, the checkpoint of this "
+                f"server, got {robot.checkpoint[:80]!r}; start the client with the first"
             )
         logger.info(
             "lerobot: a client of %r %r begins", robot.policy_type[:80], robot.checkpoint[:80]

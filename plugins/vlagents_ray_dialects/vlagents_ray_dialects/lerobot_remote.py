@@ -86,7 +86,7 @@ class Feature(BaseModel, extra="forbid"):
     dtype: str = Field(default="float32", description="its dtype")
     kind: str = Field(default="tensor", description="tensor, or rgb for an image (H, W, 3) uint8")
     names: list[str] = Field(default_factory=list, description="names of the numbers of a vector")
-    semantics: str = Field(description="convention in words, which the client must state alike")
+    semantics: str = Field(description="convention in words, which must equal the client's")
 
     def to_wire(self) -> dict[str, Any]:
         """Return the feature as LeRobot's `FeatureSpec` has it."""
@@ -733,8 +733,8 @@ class RobotSession(GatewayClient):
         answer = {name: body[name] for name in echoed if name in body}
         answer |= {
             "canonical_actions": self._dialect.mapping.rows(rows, spec),
-            # The client keeps these rows for the next request without reading them. They are the
-            # numbers of the policy, in which the policy reads a plan.
+            # The client keeps these rows for the next request without reading them. They are in
+            # the units of the policy, in which the policy reads a plan.
             "model_actions": None if is_chunk else rows,
             "execution_steps": steps,
             "server_durations": {"act_s": time.perf_counter() - begun},

@@ -51,7 +51,7 @@ class VlaEvalDialectConfig(DialectConfig):
     )
     observation_params: dict[str, Any] = Field(
         default_factory=dict,
-        description="parameters that benchmarks are asked for, such as send_state: true",
+        description="parameters that are requested from benchmarks, such as send_state: true",
     )
 
 

@@ -469,7 +469,9 @@ class VlagentsDialectConfig(KeylessPortConfig):
     def _one_way(self) -> VlagentsDialectConfig:
         """Reject settings for both one robot and several."""
         if self.gripper is not None and self.robots:
-            raise ValueError("gripper is for a single robot; with robots, state each robot's own")
+            raise ValueError(
+                "expected `gripper` for a single robot, got it with `robots`; set it for each robot"
+            )
         return self
 
 

@@ -74,7 +74,7 @@ class RobotGroup(_FleetModel):
     models: dict[Name, ModelUse] = Field(
         min_length=1,
         examples=["{pi0: {rows: 50}}"],
-        description="uses of models, by the models' names below `models`",
+        description="how the robots use each model, by the model's name below `models`",
     )
 
 

@@ -47,7 +47,7 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True)
 class Packing:
-    """A solution: the choice of each model, and the GPUs that have each layout."""
+    """A solution: the choice of each model, and the number of GPUs with each layout."""
 
     choices: Mapping[str, Choice]
     layouts: Sequence[tuple[Layout, int]]

@@ -279,8 +279,7 @@ def _pieces(demand: Demand, pool: GpuPool, parts: int) -> Iterator[Piece]:
         return
     smallest = max(1, math.ceil(pool.finest_fraction * parts - 1e-9))
     for share in range(smallest, parts + 1, smallest):
-        # Replicas of which no more fit on a GPU than of larger ones would waste the remaining
-        # share.
+        # A replica can share a GPU only if its memory fits on one.
         if share == parts or demand.memory_gb <= pool.memory_gb:
             yield Piece(demand.model, share)
 

@@ -622,7 +622,7 @@ class World:
             replica.miss(stream, number)
 
     def resend(self, stream: Stream, number: int) -> None:
-        """Send a request whose replica was lost to another replica."""
+        """Move the session of a request whose replica was lost, and send the request again."""
         if stream.asks != number:
             return
         if not self.move(stream):

@@ -38,7 +38,7 @@ OPENPI: dict[str, Any] = {"protocol": "openpi", "urls": ["ws://127.0.0.1:9"], "m
         ({"urls": []}, "at least 1"),
         ({"urls": ["http://box:1"]}, "expected ws://HOST:PORT or wss://HOST:PORT for openpi"),
         ({"urls": ["ws://me:secret@box:1"]}, "name it in key_env"),
-        ({"mapping": None}, "openpi has none of its own; give an object, or a preset"),
+        ({"mapping": None}, "openpi has no default; give an object, or a preset"),
         ({"mapping": "openpi-libera"}, "openpi-libero"),
         ({"mapping": {"camera": {}}}, r"got \['camera'\]"),
         ({"contract": {"chunks": 3}}, r"got \['chunks'\]"),

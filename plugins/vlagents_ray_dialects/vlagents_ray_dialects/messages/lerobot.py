@@ -226,7 +226,7 @@ def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: flo
     """
     if timestep + len(rows) > _STEPS:
         raise InvalidObservation(
-            f"timestep: expected one that leaves numbers for {len(rows)} actions, got {timestep}"
+            f"timestep: expected a number that leaves room for {len(rows)} actions, got {timestep}"
         )
 
     opcodes = [

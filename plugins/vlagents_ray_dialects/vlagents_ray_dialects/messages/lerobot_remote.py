@@ -264,7 +264,7 @@ def _tensor(node: Mapping[str, Any], data: bytes, shape: list[int]) -> np.ndarra
         )
     array = _array(np.dtype(name).newbyteorder("<" if order == "little" else ">"), data, shape)
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise MalformedMessage("tensor: expected finite numbers, got one that is not")
+        raise MalformedMessage("tensor: expected finite numbers, got NaN or infinity")
     return array
 
 

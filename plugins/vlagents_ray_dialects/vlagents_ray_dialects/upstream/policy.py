@@ -141,7 +141,7 @@ class UpstreamConfig(BaseModel, extra="forbid"):
             )
         if self.mapping is None and self.client.mapping is None:
             raise ValueError(
-                f"mapping: {self.protocol} has none of its own; give an object, or a preset, such "
+                f"mapping: {self.protocol} has no default; give an object, or a preset, such "
                 "as openpi-libero for openpi"
             )
         self.keys()  # raises an error for an invalid mapping

@@ -244,7 +244,7 @@ def _check_sensors(settings: RosSettings, where: str) -> None:
         if type_of_topic.setdefault(topic.topic, topic.type) != topic.type:
             raise ConfigError(
                 f"{where}: {name}: expected {topic.topic} as {type_of_topic[topic.topic]}, as "
-                f"elsewhere in the file, got {topic.type}; give it one type"
+                f"elsewhere in the file, got {topic.type}; use one type for it"
             )
 
     if not settings.sensors:
