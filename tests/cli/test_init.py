@@ -193,5 +193,5 @@ def test_a_plugin_of_a_name_that_is_registered_is_refused(
 ) -> None:
     """The plug-in's own test could not pass."""
     status, said = new("plugin", name)
-    assert (status, f"'{name}' is the name of a {kind} already" in said) == (2, True)
+    assert (status, f"'{name}' is already the name of a {kind}" in said) == (2, True)
     assert list(folder.iterdir()) == []
