@@ -170,6 +170,24 @@ def test_one_signal_ends_an_evaluation_that_hangs(
     evaluate_interrupted(policy, workers, finished, number, tmp_path)
 
 
+@pytest.mark.ray
+@pytest.mark.slow
+def test_one_signal_ends_an_evaluation_whose_policy_hangs_while_its_server_starts(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "own.py").write_text(MODULE)
+    options = ["--policy", "own:Initialize", "--workers", "1", "--video", "none", "--out", "out"]
+    words = ["eval", "tabletop", *options]
+    # The replica runs in the folder of the command.
+    status, printed = interrupted(words, signal.SIGTERM, tmp_path)
+    assert status == 130, printed
+    assert "Traceback" not in printed
+    [error] = [line for line in printed.splitlines() if line.startswith("Error: ")]
+    assert error == (
+        "Error: interrupted while Ray and the policies started; no episode began: repeat the command"
+    )
+
+
 @pytest.mark.parametrize(
     ("policy", "finished", "number"),
     [("Initialize", 0, signal.SIGTERM), ("Close", EPISODES, signal.SIGINT)],

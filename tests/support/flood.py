@@ -1117,8 +1117,10 @@ class Load:
 
         def take_turns() -> None:
             due_s = 0.0  # CPU time that this thread is to take, less what it has taken
-            while time.monotonic() < end:
-                due_s += share * period_s
+            before = time.monotonic()
+            while (now := time.monotonic()) < end:
+                due_s += share * min(now - before, 0.1)
+                before = now
                 turn = time.thread_time()
                 # Without the GIL, as system calls are.
                 size = int(due_s * bytes_per_s)
