@@ -201,7 +201,7 @@ def columns() -> Iterator[str]:
 
 
 _RAPTOR = (
-    "a recurrent policy for quadrotors by its authors' weights, in 58 lines | PyPI | "
+    "a recurrent policy for quadrotors by its authors' weights, in one short file | PyPI | "
     f"{verified('RAPTOR')}"
 )
 _OWN_POLICY = "a class with `initialize`, `reset` and `act` | `vlagents-ray init policy NAME` | "
