@@ -24,8 +24,10 @@ What is charged to the rate of a key:
   request, and ends.
 - A WebSocket that ends before its first message, or with an invalid frame, costs one request.
 
-A rejected request costs nothing. A limit per key that concerns messages, requests or control frames
-belongs here, and then applies at every endpoint.
+A rejected request costs nothing. A limit per key on the number of messages, requests or control
+frames belongs here, and then applies at every endpoint. A limit on the content of requests, such as
+the size of images, belongs in `vlagents_ray.serve.engine.sender.Sender`, which receives the decoded
+requests of every endpoint with their key.
 """
 
 from __future__ import annotations
