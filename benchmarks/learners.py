@@ -51,7 +51,8 @@ BEFORE = "before"  # the folder of the policy that all learners begin with
 EXECUTE = 4  # number of executed rows of a chunk
 TOGETHER = 16  # number of tabletop episodes that run at the same time
 COSTS = "costs.json"
-SEEDS_APART = 10_000  # distance of the first episodes of two seeds, so that no episodes are shared
+# Difference of the first episodes of two runs with successive seeds, which share no episodes.
+SEEDS_APART = 10_000
 # First seeds of recordings and trainings; seeds of evaluations begin at 0.
 CORRECTIONS, DEMONSTRATIONS = 2_000_000, 3_000_000
 RATE = "5e-4"  # learning rate of `dagger` and `cloning`

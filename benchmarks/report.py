@@ -271,8 +271,8 @@ def section(results: Mapping[str, Any]) -> str:
             parts.append(_use(use))
     if link := results.get("link"):
         name = (
-            f"The same over a link of {link['link']['measured_mbit_per_s']:.0f} Mbit/s between "
-            "two network namespaces"
+            f"Round trips of one call over a link of {link['link']['measured_mbit_per_s']:.0f} "
+            "Mbit/s between two network namespaces"
         )
         parts.append(_round_trips(name, link))
     parts += [_throughput(results[name]) for name in THROUGHPUTS if results.get(name)]
@@ -286,10 +286,11 @@ def _origin(results: Mapping[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     return (
         f"Measured {results['date']} by `{results['command']}` on {machine['cpu']}, "
-        f"{machine['cores']} cores, {machine['memory_gb']} GB, Linux {machine['kernel']}, load "
-        f"average {machine['load']:.1f} before it began. {versions}. Two 224x224 RGB cameras, a "
-        "policy that does nothing, all systems interleaved in rounds of 100 calls; brackets "
-        "contain 95 % intervals. Each round begins cold, which explains most of the column p99."
+        f"{machine['cores']} cores, {machine['memory_gb']} GB, Linux {machine['kernel']}; "
+        f"the load average before the measurement was {machine['load']:.1f}. {versions}. "
+        "Two 224x224 RGB cameras, a policy that does nothing, all systems interleaved in rounds of "
+        "100 calls; brackets contain 95 % intervals. Each round begins cold, which explains most "
+        "of the p99 times."
     )
 
 

@@ -326,7 +326,7 @@ def test_the_protocol_states_the_limits_that_hold(name: str) -> None:
 
 
 def test_the_figures_of_the_readme_are_the_measured_ones() -> None:
-    own, link = re.split(r"The same over a link", _read("measured_tables.md"))
+    own, link = re.split(r"Round trips of one call over a link", _read("measured_tables.md"))
     for table, names, row in (
         (own, _ON_ONE_MACHINE, r"^\| {} \| (\S+) \|"),
         (link, _OVER_THE_LINK, r"\| {} \| (\S+) \|$"),

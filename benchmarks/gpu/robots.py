@@ -73,7 +73,8 @@ def act_together(pipes: Sequence[Any], seconds: float) -> dict[str, Any]:
 
 
 def _drive(pipe: Any, url: str, contract: Contract | None, seed: int) -> None:
-    """Call the policy for each number of seconds that the pipe delivers, until it is closed.
+    """Call the policy repeatedly for each duration, s, that arrives on the pipe, and send the
+    figures back, until the pipe is closed.
 
     This function runs in a separate process.
     """

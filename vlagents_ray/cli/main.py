@@ -150,8 +150,8 @@ def doctor(
     ] = [],  # noqa: B006
     as_json: AsJson = False,
 ) -> None:
-    """Check this machine, and print the cure of each problem: Python, Ray, GPU, torch, JAX,
-    rendering, shared memory and ports.
+    """Check Python, Ray, the GPU, torch, JAX, rendering, shared memory and ports of this machine,
+    and print the cure of each problem.
 
     Exit status: 0 if no check failed, 1 if one did.
     """

@@ -351,7 +351,7 @@ def egl_probe(timeout_s: float = TIMEOUT_S) -> RenderProbe:
 
 
 def vulkan_cure() -> str:
-    """Return the cure for this machine if SAPIEN finds no rendering device."""
+    """Return the text that explains how to give SAPIEN a rendering device on this machine."""
     nvidia = Path("/dev/nvidiactl").exists() or shutil.which("nvidia-smi") is not None
     return VULKAN_CURE_NVIDIA if nvidia else VULKAN_CURE
 

@@ -16,7 +16,8 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.robot.limits import MotionLimits
 
 SOFT_START_S = 120.0
-# The relative rounding error of a float32, with a margin for larger actions of earlier ticks.
+# Twice the relative rounding error of a float32, since actions may be computed from larger ones of
+# earlier ticks.
 _ROUNDING = 2.0**-23
 # The first action may be as far away as the arm moves in this time at its velocity limit, s.
 _FIRST_S = 0.5

@@ -362,7 +362,7 @@ class LoopReport:
     apply_p50_ms: float = 0.0  # the time of `robot.apply` alone
     # The number of ticks with the safe action or without any action, by cause.
     safe: dict[Cause, int] = field(default_factory=dict)
-    # The first reason for each cause, in words.
+    # Why the first tick of each cause had the safe action or none, in words.
     reasons: dict[Cause, str] = field(default_factory=dict)
     # The number of ticks at which the robot did not move because all rows were executed and the
     # next answer had not arrived.

@@ -78,7 +78,7 @@ class _Waiting:
 
     observation: RobotObservation
     robot: PolicyInstructions
-    obs: Obs  # the same observation, with the policy's names
+    obs: Obs  # the same observation, under the policy's names for cameras and state
     instruction: str | None
     admission: MessageAdmission
 

@@ -40,7 +40,9 @@ def spec(): ...
 
 @pytest.fixture(autouse=True)
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Install stand-ins for LeRobot and Octo, whose modules import others as any module does."""
+    """Install stand-ins for LeRobot and Octo, whose modules import other modules, such as
+    `subprocess`, as real ones do.
+    """
     for name, source in SOURCE.items():
         file = tmp_path / "site" / name
         file.parent.mkdir(parents=True, exist_ok=True)

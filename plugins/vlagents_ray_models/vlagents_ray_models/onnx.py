@@ -412,7 +412,8 @@ def _shape(name: str, lengths: Sequence[int] | None, config: OnnxConfig) -> tupl
         config: The settings, whose shape has priority over the file's shape.
 
     Raises:
-        ConfigError: More than one length is open, or all are.
+        ConfigError: Neither the settings nor the file specify a shape, or more than one length is
+            -1.
     """
     configured = config.inputs[name].shape if name in config.inputs else None
     shape = lengths if configured is None else configured

@@ -364,7 +364,8 @@ class MujocoArm:
 
         world = spec.worldbody
         world.add_light(pos=[0, 0, 3], dir=[0.2, 0.1, -1])
-        # The floor collides with nothing. With `contype` 0, URDF files would lose it as a visual.
+        # The floor collides with nothing. With `contype` 0 too, MuJoCo would treat it as a visual
+        # geom, and discard it in a model from a URDF file.
         floor = {"size": [3, 3, 0.1], "pos": [0, 0, -0.01], "contype": 1 << 20, "conaffinity": 0}
         world.add_geom(type=self._mujoco.mjtGeom.mjGEOM_PLANE, rgba=[0.45, 0.45, 0.42, 1], **floor)
 

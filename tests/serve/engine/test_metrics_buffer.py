@@ -199,7 +199,7 @@ def test_load_is_the_busy_share_and_the_mean_queue(engine: Engine) -> None:
     submit(
         engine, "a", Request("act", Obs(info={"wait": True})), lambda _: answered.release() and None
     )
-    wait_for(lambda: engine.queue.depth() == 0)  # the act is in its batch
+    wait_for(lambda: engine.queue.depth() == 0)  # the call has left the queue and is in a batch
     for name in ("b", "c"):
         submit(engine, name, Request("act", Obs()), lambda _: answered.release() and None)
     meter.read()

@@ -163,7 +163,7 @@ def test_the_ticks_of_a_request_behind_a_hung_call_count_once_with_the_answer_th
 
 
 def test_the_ticks_of_an_act_that_is_checked_twice_count_once(engine: Engine) -> None:
-    """An act is checked again after a search for its session."""
+    """After the search for its session, a call is checked a second time and queued."""
     ask(engine, "good", "reset")
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     act = pending("good", act_with_report(), replies.put)

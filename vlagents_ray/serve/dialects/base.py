@@ -525,7 +525,8 @@ async def act_together(
     charge = message.charge
     if charge is None:
         raise TypeError(
-            "message: expected a message with a charge, as `RouteDialect.arrived` creates it"
+            "message.charge: expected the charge to the client's key, got None; create the message "
+            "with `RouteDialect.arrived`"
         )
     charge.cover(len(observations))
 

@@ -125,7 +125,8 @@ class HttpClient(UpstreamClient):
         if len(body) > max_bytes:
             self.close()
             raise MessageTooLarge(
-                f"upstream {self.options.url}: an answer of more than {max_bytes} bytes"
+                f"upstream {self.options.url}: expected an answer of at most {max_bytes} bytes, "
+                "got a larger one"
             )
         if response.will_close:
             self.close()

@@ -25,7 +25,7 @@ from vlagents_ray_sims.experts.osc_pose import (
 )
 
 _LIFT_M = 0.2  # minimum height by which an object is lifted, to pass over other objects, m
-_DOWNWARDS_M = 0.08  # height by which an object is lifted that is moved to a lower target, m
+_DOWNWARDS_M = 0.08  # height by which an object is lifted if its target is lower than it, m
 _CLEAR_M = 0.12  # height of a carried object above its target
 _LEAVE_M = 0.15
 _HANDLE_M = 0.121  # from the middle of a drawer to the outer side of its handle

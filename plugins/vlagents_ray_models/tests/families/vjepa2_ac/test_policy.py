@@ -29,7 +29,7 @@ from vlagents_ray_models.vjepa2_ac import VJepa2Ac
 
 pytestmark = [
     pytest.mark.source("VJEPA2_SRC"),
-    # Upstream names things that its libraries have renamed since.
+    # The authors' code uses names that timm and torch have since deprecated.
     pytest.mark.filterwarnings(
         "ignore:Importing from timm.models.layers is deprecated:FutureWarning"
     ),
