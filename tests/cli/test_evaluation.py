@@ -189,7 +189,7 @@ def test_an_episode_without_a_result_ends_the_command_with_status_1(
     status, stated = end_of(lost(tmp_path), monkeypatch)
     assert status == 1
     assert stated == (
-        "error 1 of 4 episodes have no result: lost to infrastructure, the last one to env_failed: "
+        "Error: 1 of 4 episodes have no result: lost to infrastructure, the last one to env_failed: "
         "env step: RuntimeError: it exploded; the report lists every attempt under Errors, "
         "--resume tries them again"
     )

@@ -37,7 +37,7 @@ def test_the_protocol_is_recorded_with_what_deviates_from_it(pusht: EvalEnv) -> 
     assert protocol["deviations"] == []
     with make_env(NAME, max_steps=50) as shorter:
         assert shorter.describe()["protocol"]["deviations"] == [
-            "max_steps: 50 instead of 300 in the protocol"
+            "max_steps: 50, the protocol says 300"
         ]
 
 

@@ -42,8 +42,8 @@ def test_what_was_played_by_the_protocol_deviates_in_nothing() -> None:
 def test_each_deviation_is_told_with_what_the_protocol_says() -> None:
     told = PROTOCOL.describe(max_steps=50, control_hz=20.0, ends_on_success=False)["deviations"]
     assert told == [
-        "max_steps: 50 instead of 200 in the protocol",
-        "ends_on_success: False instead of True in the protocol",
+        "max_steps: 50, the protocol says 200",
+        "ends_on_success: False, the protocol says True",
     ]
 
 

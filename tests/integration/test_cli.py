@@ -170,7 +170,7 @@ def test_a_file_of_runs_is_one_evaluation_of_all(ray_home: Path, tmp_path: Path)
     again = ["eval", str(file), "--episodes", "9"]
     refused = CliRunner().invoke(app, again, env={"COLUMNS": "120"})
     assert refused.exit_code == 2
-    assert "got ['episodes'] with it" in refused.stderr
+    assert "got ['episodes'] as well" in refused.stderr
 
 
 def command(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:

@@ -55,7 +55,7 @@ class BenchmarkProtocol:
         for name, value in settings.items():
             expected = getattr(self, name)
             if value != expected:
-                deviations.append(f"{name}: {value} instead of {expected} in the protocol")
+                deviations.append(f"{name}: {value}, the protocol says {expected}")
         return asdict(self) | {"deviations": deviations}
 
 

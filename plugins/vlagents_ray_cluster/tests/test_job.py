@@ -239,6 +239,7 @@ def test_a_node_that_slurm_ends_between_two_attempts_starts_no_ray(tmp_path: Pat
     program = tmp_path / "ray"
     program.write_text("#!/bin/sh\nexec sleep 60\n")
     program.chmod(0o755)
+    handler_before = signal.getsignal(signal.SIGTERM)
     with (
         pytest.MonkeyPatch.context() as patch,
         node.ended_by_slurm(),
@@ -247,4 +248,4 @@ def test_a_node_that_slurm_ends_between_two_attempts_starts_no_ray(tmp_path: Pat
         signal.raise_signal(signal.SIGTERM)
         status, has_started = node.run_ray()
     assert (status, has_started) == (-signal.SIGTERM, False)
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) is handler_before

@@ -111,7 +111,7 @@ def test_a_file_that_is_gone_is_said_in_one_sentence(
     [gone] = (results.out / "trajectories").rglob(f"ep0001_*.{end}")
     gone.unlink()
     with pytest.raises(
-        ConfigError, match=rf"{gone.name}: expected a file.*, got none; copy the folder again"
+        ConfigError, match=rf"{gone.name}: expected the file .*, got none; copy the folder again"
     ):
         to_lerobot(results, tmp_path / "dataset")
     assert list(tmp_path.glob("dataset*")) == []

@@ -276,7 +276,7 @@ def test_a_file_of_an_episode_that_is_gone_is_said_in_one_sentence_and_nothing_i
     [gone] = (a / kind).rglob("ep0003_*.mp4" if kind == "videos" else "ep0003_*.npz")
     gone.unlink()
     with pytest.raises(
-        ConfigError, match=rf"{gone.name}: expected a file.*, got none; copy the folder again"
+        ConfigError, match=rf"{gone.name}: expected the file .*, got none; copy the folder again"
     ):
         merge(tmp_path / "out", [a])
     assert not list((tmp_path / "out").rglob("*.*"))

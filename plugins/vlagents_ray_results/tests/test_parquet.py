@@ -64,5 +64,5 @@ def test_parquet_holds_the_values_of_each_episode(results: Results, tmp_path: Pa
 
 
 def test_a_table_is_a_file_in_a_folder_that_exists(results: Results, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="expected a file in a folder that exists"):
+    with pytest.raises(ConfigError, match="expected a file in an existing folder"):
         to_parquet(results, tmp_path / "missing" / "a.parquet")
