@@ -12,7 +12,7 @@ import logging
 import os
 import socket
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 
 import ray
 
@@ -31,6 +31,7 @@ _RAY_TIMEOUT_S = 60.0  # Ray's default for this time
 # orderly end.
 _SHARE = 0.4
 _SOCKETS = Path("/proc/net/unix")
+_LOOK_S = 0.05  # interval of the checks of `head_ends_within`, s
 
 
 class HeadMonitor:
@@ -107,6 +108,16 @@ def head_is_gone() -> bool:
     except OSError as error:
         return isinstance(error, ConnectionRefusedError)  # otherwise the head may be busy
     return False
+
+
+def head_ends_within(seconds: float) -> bool:
+    """Wait for at most this time until the head refuses connections; return whether it does."""
+    end = monotonic() + seconds
+    while not head_is_gone():
+        if monotonic() >= end:
+            return False
+        sleep(_LOOK_S)
+    return True
 
 
 def _address() -> tuple[str, int]:

@@ -491,12 +491,12 @@ def long_polls(client: Any) -> Iterator[Any]:
             yield shared.long_poll_client
 
 
-def begin_to_end(client: Any, names: Sequence[str]) -> None:
-    """Begin to end applications, without waiting.
+def begin_to_end(client: Any, names: Sequence[str]) -> Any:
+    """Begin to end applications, without waiting; return the ref of the call.
 
     `serve.delete` would wait for each application, for at most a minute.
     """
-    client._controller.delete_apps.remote(list(names))
+    return client._controller.delete_apps.remote(list(names))
 
 
 def list_applications(client: Any) -> Any:

@@ -4,6 +4,7 @@ many GPUs it needs.
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from contextlib import nullcontext
@@ -322,6 +323,19 @@ def test_a_controller_that_ends_or_that_does_not_answer_is_no_error(
     assert ("has not ended within" in caplog.text) is said
 
 
+def test_nothing_is_requested_of_serve_if_the_head_ends_as_well(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """systemd sends SIGTERM to the server and to Ray's head. Ray would print each failed request."""
+    looks = itertools.count()
+    monkeypatch.setattr(head_monitor, "head_is_gone", lambda: next(looks) > 1)
+    client = client_of_serve()
+    client._controller = SimpleNamespace()  # any request raises an error
+    server.end_applications(client, ["app"])
+    server.shut_down(client)
+    assert client._shutdown
+
+
 @pytest.mark.parametrize("skipped_before", [None, "a line of the user's"])
 def test_no_poll_that_a_proxy_loses_with_the_controller_is_printed(
     skipped_before: str | None,
@@ -335,6 +349,7 @@ def test_no_poll_that_a_proxy_loses_with_the_controller_is_printed(
     monkeypatch.setattr(stdout_deduplicator, "skip_re", expression)
     monkeypatch.setattr(stdout_deduplicator, "recent", {})
     monkeypatch.setattr(ray, "wait", lambda refs, **_: (refs, []))
+    monkeypatch.setattr(head_monitor, "head_is_gone", lambda: False)
     for _ in range(2):
         server.shut_down(client_of_serve())
 

@@ -46,6 +46,8 @@ _SHUTDOWN_S = 30.0
 # Time within which Serve's proxies must listen, s. On a busy node, Serve replaces several proxies
 # before one of them listens.
 _PROXIES_S = 180.0
+# Time in which Ray's head, which systemd stops together with this process, refuses connections, s.
+_HEAD_S = 0.3
 _HAPROXY_S = 0.5  # time in which HAProxy is updated after the end of an application, s
 # Interval of the checks whether Serve's proxies listen, and whether Serve has ended, s.
 _LOOK_S = 0.2
@@ -85,8 +87,23 @@ def end_applications(client: Any, names: Sequence[str]) -> None:
     When Serve shuts down, it stops HAProxy immediately. This would end the connections of the
     clients before the replicas have sent their answers and closed the WebSockets. If only the
     applications are removed, HAProxy keeps these connections; see also `haproxy.close_port`.
+
+    If Ray's head ends as well, nothing is requested of Serve, since Ray would print that the
+    requests failed.
     """
-    private.begin_to_end(client, names)
+    if head_monitor.head_ends_within(_HEAD_S):
+        return
+
+    ending = private.begin_to_end(client, names)
+    try:
+        _wait_for_the_end_of_applications(client)
+    finally:
+        # Ray prints the error of a call whose result nobody has read.
+        with contextlib.suppress(ray.exceptions.RayError):
+            ray.get(ending, timeout=0)
+
+
+def _wait_for_the_end_of_applications(client: Any) -> None:
     deadline = time.monotonic() + _SHUTDOWN_S
     while time.monotonic() < deadline and not head_monitor.head_is_gone():
         listing = private.list_applications(client)
@@ -117,13 +134,18 @@ def shut_down(client: Any) -> None:
     client.shutdown_cached_handles()
 
     private.silence_lost_polls()
+    if not head_monitor.head_is_gone():
+        _end_serve(client)
+    private.forget_serve(client)
+
+
+def _end_serve(client: Any) -> None:
     ending = private.end_controller(client)
     deadline = time.monotonic() + _SHUTDOWN_S
     while not ray.wait([ending], timeout=_LOOK_S)[0] and not head_monitor.head_is_gone():
         if time.monotonic() > deadline:
             log.warning("Serve has not ended within %g s and keeps running", _SHUTDOWN_S)
-            break
-    private.forget_serve(client)
+            return
 
 
 @dataclass(frozen=True, slots=True)
