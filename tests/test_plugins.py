@@ -344,7 +344,8 @@ def test_a_robot_a_leader_and_a_subcommand_that_are_not_installed_name_their_dis
     assert robot.main(["lift", "crane:4"]) == 2
     error = capsys.readouterr().err
     assert error.startswith(
-        "Error: ConfigError: command 'robot lift' is in vlagents-ray-cranes, which is not installed: pip "
+        "Error: ConfigError: command 'robot lift' is in vlagents-ray-cranes, which is not "
+        "installed: pip "
     )
     with pytest.raises(SystemExit):
         robot.main(["--help"])

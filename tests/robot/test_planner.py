@@ -178,8 +178,8 @@ def test_a_subtask_that_is_too_old_holds_the_robot_until_there_is_a_newer_one(
 ) -> None:
     ticks.run(3.2)
     assert ticks.robot.holds == (
-        "planner: expected a subtask of at most 3 s, got a subtask of 3.2 s: the planner has not answered "
-        "yet; see the planner's server, or raise max_age_s"
+        "planner: expected a subtask of at most 3 s, got a subtask of 3.2 s: the planner has not "
+        "answered yet; see the planner's server, or raise max_age_s"
     )
     ticks.answer()
     ticks.run(0.1)

@@ -5,6 +5,7 @@ not notice.
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import json
 import os
@@ -92,6 +93,44 @@ def acts_alone(robot: ShmTransport) -> list[float]:
     )
 
 
+Flooding = tuple[Popen[str], str, str, flood.Where, int]  # the arguments of `flood.attacking`
+Measure = Callable[[float], list[float]]  # the times of a robot's calls, ms, in so many seconds
+
+
+def measured_beside_flood(
+    flooding: Flooding, measure: Measure, seconds: float, settle: Callable[[], None]
+) -> tuple[list[float], flood.Load]:
+    """Return the times of a robot beside a flood, and the load of the flood's own process.
+
+    Args:
+        settle: Waits until the beginning of the flood, which is not measured, is over.
+    """
+    with flood.attacking(*flooding) as attack:
+        settle()
+        with attack.measured() as loads:
+            times = measure(seconds)
+    [load] = loads
+    return times, load
+
+
+def measured_in_turns(
+    flooding: Flooding, measure: Measure, seconds: float, settle: Callable[[], None]
+) -> tuple[list[float], list[float], flood.Load]:
+    """Return the times of a robot beside the load of a flood and beside the flood itself, in turns,
+    and the last load.
+    """
+    attackers, _, _, where, _ = flooding
+    alone: list[float] = []
+    beside: list[float] = []
+    for _ in range(TURNS):
+        times, load = measured_beside_flood(flooding, measure, seconds / TURNS, settle)
+        beside += times
+        await_calm(where["pid"])
+        with flood.loading(attackers, load):
+            alone += measure(seconds / TURNS)
+    return alone, beside, load
+
+
 @pytest.mark.parametrize(("endpoint", "part", "connections"), CASES)
 def test_a_robots_act_takes_less_than_twice_as_long(
     where: flood.Where,
@@ -107,21 +146,16 @@ def test_a_robots_act_takes_less_than_twice_as_long(
 
     p99 of a robot alone is anything from 4 to 90 ms on two cores.
     """
-    attack = (attackers, endpoint, part, where, connections)
+    flooding = (attackers, endpoint, part, where, connections)
+    measure = functools.partial(flood.acts_ms, robot)
+    settle = functools.partial(await_calm, where["pid"])
     found = []
     for attempt in range(ATTEMPTS):
-        seconds = SECONDS / TURNS if attempt else SECONDS
-        alone, beside = ([], []) if attempt else (acts_alone, [])
-        for _ in range(TURNS if attempt else 1):
-            with flood.attacking(*attack) as running:
-                await_calm(where["pid"])
-                with running.measured() as loads:
-                    beside += flood.acts_ms(robot, seconds)
-            [load] = loads
-            if attempt:
-                await_calm(where["pid"])
-                with flood.loading(attackers, load):
-                    alone += flood.acts_ms(robot, seconds)
+        if attempt:
+            alone, beside, _ = measured_in_turns(flooding, measure, SECONDS, settle)
+        else:
+            alone = acts_alone
+            beside, _ = measured_beside_flood(flooding, measure, SECONDS, settle)
         alone, beside = sorted(alone), sorted(beside)
         p50, p90 = ((flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 90))
         found.append((p50, p90))
@@ -309,26 +343,28 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
         name = "replica"
     else:
         name = "HAProxy" if endpoint in flood.HTTP else endpoint
-    held = 0.0
+    flooding = (attackers, endpoint, behaviour, where, 8)
+    held_mb = []
+
+    def measure(seconds: float) -> list[float]:
+        times = flood.times_ms(call, seconds)
+        held_mb.append(resources(where["pid"])[0] - memory)
+        return times
+
+    def settle() -> None:
+        if endpoint in flood.GATEWAYS and behaviour.startswith("half a message"):
+            await_calm(where["pid"])  # 400 MB arrive at first
+
     for attempt in range(ATTEMPTS):
         if attempt or name not in alone_ms:
             await_calm(where["pid"])  # an attempt before this one may have left much to do
         if name not in alone_ms:
             alone_ms[name] = flood.times_ms(call, ROW_SECONDS)
-        seconds = ROW_SECONDS / TURNS if attempt else ROW_SECONDS
-        alone, beside = ([], []) if attempt else (alone_ms[name], [])
-        for _ in range(TURNS if attempt else 1):
-            with flood.attacking(attackers, endpoint, behaviour, where, 8) as attack:
-                if endpoint in flood.GATEWAYS and behaviour.startswith("half a message"):
-                    await_calm(where["pid"])  # 400 MB arrive at first
-                with attack.measured() as loads:
-                    beside += flood.times_ms(call, seconds)
-                held = max(held, resources(where["pid"])[0] - memory)
-            [load] = loads
-            if attempt:
-                await_calm(where["pid"])
-                with flood.loading(attackers, load):
-                    alone += flood.times_ms(call, seconds)
+        if attempt:
+            alone, beside, load = measured_in_turns(flooding, measure, ROW_SECONDS, settle)
+        else:
+            alone = alone_ms[name]
+            beside, load = measured_beside_flood(flooding, measure, ROW_SECONDS, settle)
         alone, beside = sorted(alone), sorted(beside)
         p50, p90, p99 = (
             (flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 90, 99)
@@ -348,13 +384,13 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
     )
     compared = f"a load of {load.cores:.2f} cores" if attempt else "idle cores"
     row += (
-        f", memory +{held:.0f} MB, connections gone after {ended_s:.1f} s, attempt {attempt + 1} "
-        f"against {compared}"
+        f", memory +{max(held_mb):.0f} MB, connections gone after {ended_s:.1f} s, "
+        f"attempt {attempt + 1} against {compared}"
     )
     record_property("row", row)
     print(f"ROW {endpoint} | {behaviour} | {row}")
     assert is_calm, f"{row}; {CAUSES.get((endpoint, behaviour), 'the cause is not known')}"
-    assert held < (UPLOADS_MEMORY_MB if behaviour == flood.UPLOADS else MEMORY_MB), row
+    assert max(held_mb) < (UPLOADS_MEMORY_MB if behaviour == flood.UPLOADS else MEMORY_MB), row
 
 
 def test_a_load_takes_the_cpu_time_and_the_turns_that_it_stands_for(

@@ -81,8 +81,8 @@ class Step(NamedTuple):
     chunk: Chunk  # newest chunk with a row for this step
     row: int  # index of the row in that chunk
 
-    def played(self, action: np.ndarray, tick: int, silent_s: float) -> Act:
-        """Return `action` instead of the planned action of a tick, with the info of the planned
+    def with_action(self, action: np.ndarray, tick: int, silent_s: float) -> Act:
+        """Return `action` in place of the planned action of a tick, with the info of the planned
         action's chunk.
         """
         chunk = self.chunk

@@ -653,7 +653,7 @@ class ChunkPlayer(Agent):
                 if not self._motion.can_hold:
                     raise
             else:
-                act = step.played(action, tick, self._silent_s())
+                act = step.with_action(action, tick, self._silent_s())
                 act.info.update(timing)
                 if not rows:  # the command is still approaching the row
                     return replace(act, done=False)

@@ -172,6 +172,6 @@ def _existing(file: Path | None) -> Path:
     if not path.is_file():
         raise ConfigError(
             f"keys file {path} does not exist; `vlagents-ray keys create NAME --keys {path}` "
-            f"creates it"
+            "creates it"
         )
     return path
