@@ -1,7 +1,7 @@
 """Measures the gains and the costs of learners.
 
-Each learner improves the reference policy on the tabletop, once for each seed and always from the
-same checkpoint:
+Each learner improves the pretrained reference policy on the tabletop, once for each seed and always
+from the same checkpoint:
 
 - `dagger`: the policy runs episodes, an expert takes over, and the policy is trained on the frames
   of the expert (examples/reference/dagger.py);
@@ -46,7 +46,7 @@ from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.local_agent import LocalPolicy
 
 ROOT = Path(__file__).parents[1]
-CHECKPOINT = ROOT / "examples/reference/checkpoint"
+CHECKPOINT = ROOT / "examples/reference/pretrained"
 BEFORE = "before"  # the folder of the policy that all learners begin with
 EXECUTE = 4  # number of executed rows of a chunk
 TOGETHER = 16  # number of tabletop episodes that run at the same time

@@ -60,7 +60,7 @@ from vlagents_ray_learn import (
     log_ratio,
 )
 
-CHECKPOINT = Path(__file__).parents[2] / "examples" / "reference" / "checkpoint"
+CHECKPOINT = Path(__file__).parents[2] / "examples" / "reference" / "pretrained"
 ENV = ROBOT = "tabletop"
 ENV_OPTIONS: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
 EXECUTE = 4  # executed rows of a chunk

@@ -390,6 +390,8 @@ def main(
         "parameters": sum(value.numel() for value in network.parameters()),
         "commit": code and code.commit,
     }
+    if start is not None:
+        trained["start"] = json.loads((start / MADE).read_text())
     save(checkpoint, network, out, trained)
 
 

@@ -34,7 +34,7 @@ def program(name: str) -> Any:
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
     program("dagger").record(
-        REFERENCE / "checkpoint", folder / "tabletop", episodes=6, seed=2_000_000
+        REFERENCE / "pretrained", folder / "tabletop", episodes=6, seed=2_000_000
     )
     return folder
 
@@ -56,7 +56,7 @@ def test_the_expert_takes_over_once_and_solves_each_recorded_episode(data: Path)
 def test_training_goes_on_from_the_checkpoint_with_the_experts_frames_alone(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train, start = program("train"), REFERENCE / "checkpoint"
+    train, start = program("train"), REFERENCE / "pretrained"
     monkeypatch.setattr(train, "BATCH", 16)
     before = train.read_checkpoint(start)
     checkpoint, frames = train.read(data, CAMERAS, tmp_path / "images", start=before)
