@@ -363,7 +363,7 @@ def main(
     folder: Annotated[
         Path,
         typer.Option(
-            "--out", help="Folder of the results; episodes with a result are not run again."
+            "--folder", help="Folder of the results; episodes with a result are not run again."
         ),
     ] = Path("runs/success"),
     episodes: Annotated[

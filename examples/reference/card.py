@@ -8,14 +8,15 @@ limits.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import typer
 
 from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.results.reader import CaseResults, rate_of
-from vlagents_ray.policies.reference.checkpoint import read_checkpoint
+from vlagents_ray.policies.reference.checkpoint import Checkpoint, read_checkpoint
 
 _TEXT = """---
 license: apache-2.0
@@ -40,24 +41,20 @@ instruction names other colours or another task, so that a policy that reads it 
 
 `vlagents-ray verify NAME.bundle.zip` checks these results.
 
-## Data
-
-Scripted experts recorded the demonstrations (`examples/reference/demonstrations/`). Failed \
-episodes were left out.
-
-| robot | episodes | frames | cameras |
-|---|---|---|---|
-{data}
-
 ## Training
 
-- {steps} steps of {batch} frames out of {trained_frames}; seed {seed}; {threads} threads, \
-{processor}, torch {torch}.
+Scripted experts recorded the demonstrations (`examples/reference/demonstrations/`, and `dagger.py \
+demonstrate` for the second
+training). Failed episodes were left out. The first training used lossy H.264 video. The images of \
+the second training are
+lossless.
+
+{trainings}
+
 - {millions:.1f} million parameters in float32, `model.safetensors`; sizes, words and robots are \
 in `config.json`.
-- Code: commit {commit}.
-- `make reference` repeats all steps. On the same kind of processor, a second run gave \
-bit-identical weights.
+- `make reference` repeats all steps. On the same kind of processor, a second run of the first \
+training gave bit-identical weights.
 
 ## Limits
 
@@ -84,6 +81,31 @@ def rates(results: Sequence[Results]) -> list[str]:
     return lines
 
 
+def trainings(trained: Mapping[str, Any], stated: Checkpoint) -> list[str]:
+    """Return a text for each training, the first one first.
+
+    Args:
+        trained: The description of the last training. Its `start` describes the training before.
+        stated: The checkpoint, which names the cameras of each robot.
+    """
+    before = trained.get("start")
+    texts = [] if before is None else trainings(before, stated)
+    summary = (
+        "{steps} steps of {batch} frames out of {trained_frames}; seed {seed}; {threads} threads, "
+        "{processor}, torch {torch}; code of commit {commit}"
+    ).format(**trained)
+    lines = [
+        f"{len(texts) + 1}. {summary}",
+        "",
+        "   | robot | episodes | frames | cameras |",
+        "   |---|---|---|---|",
+    ]
+    for name, recorded in trained["robots"].items():
+        cameras = ", ".join(stated.embodiments[name].cameras.values())
+        lines.append(f"   | `{name}` | {recorded['episodes']} | {recorded['frames']} | {cameras} |")
+    return [*texts, "\n".join(lines)]
+
+
 def _rate(case: CaseResults) -> str:
     rate = rate_of([case], "success_once")
     low, high = rate.interval
@@ -96,17 +118,10 @@ def main(checkpoint: Path, evaluations: list[Path]) -> None:
     """
     results = [Results.load(folder) for folder in evaluations]
     stated, trained = read_checkpoint(checkpoint), json.loads((checkpoint / MADE).read_text())
-    data = [
-        (
-            f"| `{name}` | {one['episodes']} | {one['frames']} | "
-            f"{', '.join(stated.embodiments[name].cameras.values())} |"
-        )
-        for name, one in trained["robots"].items()
-    ]
     text = _TEXT.format(
         **trained,
         rates="\n".join(rates(results)),
-        data="\n".join(data),
+        trainings="\n\n".join(trainings(trained, stated)),
         millions=trained["parameters"] / 1e6,
         known=len(stated.words),
         words=", ".join(stated.words),

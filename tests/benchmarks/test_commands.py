@@ -4,10 +4,16 @@ starts.
 
 from __future__ import annotations
 
+import importlib
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import typer
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from benchmarks import (
@@ -28,6 +34,51 @@ from benchmarks import (
     torchrl,
 )
 from benchmarks.checkpoints import __main__ as checkpoints
+from vlagents_ray.cli.main import app as product
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+def programs() -> Iterator[tuple[str, typer.Typer]]:
+    """Yield the name and the application of each benchmark with a command line, and of the
+    product.
+    """
+    yield "vlagents_ray.cli.main", product
+    for file in sorted(BENCHMARKS.rglob("*.py")):
+        text = file.read_text()
+        if "typer.run(main)" not in text and "typer.Typer(" not in text:
+            continue
+        name = ".".join(file.relative_to(BENCHMARKS.parent).with_suffix("").parts)
+        module = importlib.import_module(name)
+        app = getattr(module, "app", None)
+        if app is None:
+            app = typer.Typer()
+            app.command()(module.main)
+        yield name, app
+
+
+def repeated_options(command: Any, path: str) -> list[str]:
+    """Return the options that a command, or a command below it, has twice."""
+    counts = Counter(
+        option
+        for parameter in command.params
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    )
+    repeated = [f"{path} {option}" for option, count in counts.items() if count > 1]
+    for name, below in getattr(command, "commands", {}).items():
+        repeated += repeated_options(below, f"{path} {name}")
+    return repeated
+
+
+def test_no_command_has_an_option_twice() -> None:
+    """The second of two options with one name would take the values of both."""
+    names = []
+    repeated = []
+    for name, app in programs():
+        names.append(name)
+        repeated += repeated_options(get_command(app), name)
+    assert len(names) > 30
+    assert repeated == []
 
 
 # Where a mistake is not noticed, the benchmark starts, and would run for as long as a test may.
