@@ -11,7 +11,7 @@ from contextlib import suppress
 
 import pytest
 
-from vlagents_ray.ray_tools.signals import interrupts, own_sigterm, stop_signals
+from vlagents_ray.signals import interrupts, own_sigterm, stop_signals
 
 # A command with a Ray whose head is lost at the first check; `{body}` is the work of the command in
 # the meantime.

@@ -29,7 +29,7 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers import in_process, rollout
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
-from vlagents_ray.ray_tools.signals import StopRequest
+from vlagents_ray.signals import StopRequest
 
 Config = Callable[..., EvalConfig]
 

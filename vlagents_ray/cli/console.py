@@ -19,8 +19,8 @@ from rich.table import Table
 from rich.text import Text
 
 from vlagents_ray.errors import ClusterLost, ConfigError, VLAgentsError
-from vlagents_ray.ray_tools.signals import interrupts
 from vlagents_ray.settings import wrong_settings
+from vlagents_ray.signals import interrupts
 
 
 class PlainConsole(Console):

@@ -21,7 +21,7 @@ from vlagents_ray.cli.console import err, say_error
 from vlagents_ray.errors import ClusterLost, ConfigError
 from vlagents_ray.ray_tools.private import LOGGERS, node_of_this_process
 from vlagents_ray.ray_tools.session import started_here
-from vlagents_ray.ray_tools.signals import is_interrupted, raise_dropped_interrupt
+from vlagents_ray.signals import is_interrupted, raise_dropped_interrupt
 
 log = logging.getLogger(__name__)
 

@@ -41,7 +41,7 @@ from vlagents_ray.evaluate.workers.rollout import (
     factory_programs,
 )
 from vlagents_ray.policies.base.program import Program
-from vlagents_ray.ray_tools.signals import StopRequest, stop_signals
+from vlagents_ray.signals import StopRequest, stop_signals
 
 log = logging.getLogger(__name__)
 POLL_S = 0.25  # maximum time until a signal is handled, s

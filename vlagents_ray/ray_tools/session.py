@@ -23,7 +23,7 @@ from urllib.parse import urlsplit
 from vlagents_ray.errors import ClusterLost, ConfigError
 from vlagents_ray.ray_tools import private
 from vlagents_ray.ray_tools.reaper import MARK, reaped
-from vlagents_ray.ray_tools.signals import own_sigterm
+from vlagents_ray.signals import own_sigterm
 
 log = logging.getLogger(__name__)
 

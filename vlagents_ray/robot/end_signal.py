@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator
 
-from vlagents_ray.ray_tools.signals import delivered
+from vlagents_ray.signals import delivered
 
 # The signals of systemd and of a closed terminal, which by default end the process at once.
 END_SIGNALS = (signal.SIGTERM, signal.SIGHUP)

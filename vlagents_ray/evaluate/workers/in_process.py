@@ -20,7 +20,7 @@ from vlagents_ray.evaluate.plan.resolved import VARIABLES, ResolvedPlan, TimeLim
 from vlagents_ray.evaluate.workers.base import WorkerHandle, Workers
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Report, Rollout
 from vlagents_ray.ray_tools.session import variables
-from vlagents_ray.ray_tools.signals import is_stopping, raised_at_once
+from vlagents_ray.signals import is_stopping, raised_at_once
 
 log = logging.getLogger(__name__)
 

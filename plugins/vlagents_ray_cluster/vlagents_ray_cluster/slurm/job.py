@@ -35,7 +35,7 @@ from typing import Any
 
 from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.ray_tools.session import FILES
-from vlagents_ray.ray_tools.signals import StopRequest, delivered
+from vlagents_ray.signals import StopRequest, delivered
 
 # Variable with the address of the first node, exported by the job's script.
 HEAD = "VLAGENTS_RAY_HEAD"

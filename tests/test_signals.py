@@ -11,8 +11,8 @@ import time
 
 import pytest
 
-from vlagents_ray.ray_tools import signals
-from vlagents_ray.ray_tools.signals import (
+from vlagents_ray import signals
+from vlagents_ray.signals import (
     StopRequest,
     delivered,
     interrupts,
@@ -24,7 +24,7 @@ from vlagents_ray.ray_tools.signals import (
 # threads, and ends with status 1.
 PROGRAM = """
 import faulthandler, os, random, signal, sys, threading, time
-from vlagents_ray.ray_tools.signals import delivered, interrupts, raised_at_once, stop_signals
+from vlagents_ray.signals import delivered, interrupts, raised_at_once, stop_signals
 
 faulthandler.dump_traceback_later(30, exit=True)
 NUMBERS = [signal.SIGINT, signal.SIGTERM]
@@ -206,7 +206,7 @@ def test_a_wakeup_descriptor_of_the_program_is_left_alone() -> None:
 
 def test_signals_of_a_forked_child_do_not_wake_its_parent() -> None:
     run_program("""
-from vlagents_ray.ray_tools import signals
+from vlagents_ray import signals
 with delivered():
     signal.signal(signal.SIGTERM, lambda *_: os._exit(7))
     child = os.fork()

@@ -1,6 +1,4 @@
-"""Signal handlers: Ctrl-C and SIGTERM in a process that uses Ray, and a flag that requests a
-stop.
-"""
+"""Signal handlers: Ctrl-C and SIGTERM in a command, and a flag that requests a stop."""
 
 from __future__ import annotations
 
