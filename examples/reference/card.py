@@ -43,11 +43,11 @@ instruction names other colours or another task, so that a policy that reads it 
 
 ## Training
 
-Scripted experts recorded the demonstrations (`examples/reference/demonstrations/`, and `dagger.py \
-demonstrate` for the second
-training). Failed episodes were left out. The first training used lossy H.264 video. The images of \
-the second training are
-lossless.
+Scripted experts recorded the demonstrations (`examples/reference/demonstrations/`, and for the \
+second training
+`dagger.py demonstrate`). Failed episodes were left out. The first training used lossy H.264 \
+video, the second lossless
+images.
 
 {trainings}
 
