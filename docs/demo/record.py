@@ -24,8 +24,8 @@ from vlagents_ray.serve.launch.server import running_server
 FILE = Path(__file__).with_name("session.js")
 CHECKPOINT = Path(__file__).parents[2] / "examples/reference/checkpoint"
 POLICY = {"checkpoint": str(CHECKPOINT), "embodiment": "tabletop"}
-# The seeds of each task. The policy fails with few seeds; these include three of them, so that the page
-# also shows failures.
+# The seeds of each task. The policy fails with few seeds; these include three of them, so that the
+# page also shows failures.
 SEEDS = {"pick_place": range(12, 16), "slide": range(4), "stack": range(16, 20)}
 EXECUTE = 4  # executed rows of each chunk
 STAGES = ("decode_ms", "queue_ms", "inference_ms", "encode_ms", "wire_ms")
