@@ -21,6 +21,9 @@ from benchmarks.hosts import Host, HostFailed, hosts
 
 _TOOLS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "scontrol", "squeue", "scancel")
 _READY_S = 60.0
+# Longest wait for a job, s. Beside 12 other processes on two cores, the start of Ray on two nodes
+# took more than 180 s.
+_JOB_S = 300.0
 ENDED = {"CANCELLED", "COMPLETED", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "TIMEOUT"}
 _CONFIGURATION = """
 ClusterName=test
@@ -81,12 +84,12 @@ class Slurm:
             "squeue", "--noheader", "--format=%T", "--states=all", f"--jobs={job}"
         ).strip()
 
-    def wait_for_end(self, job: str, timeout_s: float = 240.0) -> str:
+    def wait_for_end(self, job: str, timeout_s: float = _JOB_S) -> str:
         """Wait until the job is over, and return its last state."""
         self.wait_for(job, lambda: self.state(job) in ENDED, timeout_s)
         return self.state(job)
 
-    def wait_for(self, job: str, true: Callable[[], bool], timeout_s: float = 180.0) -> None:
+    def wait_for(self, job: str, true: Callable[[], bool], timeout_s: float = _JOB_S) -> None:
         """Poll until `true()`; after the time limit, raise an error with Slurm's information about
         the job.
         """
