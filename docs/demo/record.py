@@ -40,7 +40,9 @@ def main() -> None:
         running_server(served, num_cpus=2) as server,
         RemoteAgent(server.url, transport="websocket") as agent,
     ):
-        episodes = [play(agent, task, seed) for task, seeds in SEEDS.items() for seed in seeds]
+        episodes = []
+        for task, seeds in SEEDS.items():
+            episodes += [play(agent, task, seed) for seed in seeds]
     rates = json.loads((CHECKPOINT / "rates.json").read_text())["tabletop"]
     recording = {"version": version("vlagents-ray"), "cores": os.cpu_count(), "stages": STAGES}
     recording |= {"geometry": geometry(), "palette": render.PALETTE}

@@ -81,15 +81,15 @@ def rates(results: Sequence[Results]) -> list[str]:
     return lines
 
 
-def trainings(trained: Mapping[str, Any], stated: Checkpoint) -> list[str]:
+def trainings(trained: Mapping[str, Any], checkpoint: Checkpoint) -> list[str]:
     """Return a text for each training, the first one first.
 
     Args:
         trained: The description of the last training. Its `start` describes the training before.
-        stated: The checkpoint, which names the cameras of each robot.
+        checkpoint: It names the cameras of each robot.
     """
     before = trained.get("start")
-    texts = [] if before is None else trainings(before, stated)
+    texts = [] if before is None else trainings(before, checkpoint)
     summary = (
         "{steps} steps of {batch} frames out of {trained_frames}; seed {seed}; {threads} threads, "
         "{processor}, torch {torch}; code of commit {commit}"
@@ -101,7 +101,7 @@ def trainings(trained: Mapping[str, Any], stated: Checkpoint) -> list[str]:
         "   |---|---|---|---|",
     ]
     for name, recorded in trained["robots"].items():
-        cameras = ", ".join(stated.embodiments[name].cameras.values())
+        cameras = ", ".join(checkpoint.embodiments[name].cameras.values())
         lines.append(f"   | `{name}` | {recorded['episodes']} | {recorded['frames']} | {cameras} |")
     return [*texts, "\n".join(lines)]
 

@@ -19,8 +19,8 @@ done
   "$bin/python" examples/reference/train.py "$runs/data" "$runs/pretrained" --work "$runs/train" --every 2 \
     --cameras tabletop=front,wrist --cameras metaworld=corner2,gripperPOV
 
-# The second training is short. It uses demonstrations of the tabletop whose images keep each pixel: without it, the
-# policy solves 7 % fewer episodes if its images have no losses.
+# The second training is short. It uses demonstrations of the tabletop whose images keep each pixel. Without it, the
+# policy solves 92 instead of 98 % of the episodes from images without losses.
 if [ ! -d "$runs/lossless" ]; then
   rm -rf "$runs/recording"
   "$bin/python" examples/reference/dagger.py demonstrate "$runs/recording/tabletop"

@@ -59,11 +59,9 @@ def programs() -> Iterator[tuple[str, typer.Typer]]:
 
 def repeated_options(command: Any, path: str) -> list[str]:
     """Return the options that a command, or a command below it, has twice."""
-    counts = Counter(
-        option
-        for parameter in command.params
-        for option in (*parameter.opts, *parameter.secondary_opts)
-    )
+    counts = Counter[str]()
+    for parameter in command.params:
+        counts.update((*parameter.opts, *parameter.secondary_opts))
     repeated = [f"{path} {option}" for option, count in counts.items() if count > 1]
     for name, below in getattr(command, "commands", {}).items():
         repeated += repeated_options(below, f"{path} {name}")
