@@ -1,6 +1,7 @@
 """Robots that execute the chunks of a policy at their rate: `python -m benchmarks.fleet_robots
 JSON`.
- The process connects its robots, and writes "ready". Each line that it then reads is a run,
+
+The process connects its robots, and writes "ready". Each line that it then reads is a run,
 {"begin": s, "counted": s, "end": s} of `time.monotonic`; at the end it writes the figures of each
 robot's ticks since `counted`. A robot whose policy is late holds still at that tick, and continues
 at the next tick: the load does not decrease when the server is slow.

@@ -1,6 +1,7 @@
 """Mutation tests: small defects, drawn from all subjects of the core, and each run against the
 subject's tests.
- `python -m tests.support.mutants --seed 56 --count 60` runs them in a copy of the checkout, and
+
+`python -m tests.support.mutants --seed 56 --count 60` runs them in a copy of the checkout, and
 writes a line of JSON for each. A surviving mutant shows a missing test, unnecessary code, or a
 change without an effect. `--list` only prints them.
 """

@@ -3,10 +3,11 @@ skipped; the use of a resource without its marker is an error.
 
 So `make check`, which excludes these markers, never starts Ray and never loads a simulator. `make
 test` excludes the marker `integration`.
- On CI, `VLAGENTS_FAIL_ON_SKIP=1` turns a skipped test into a failure. CI cannot install a GPU,
- sources and assets that are on no package index, a browser that apt lacks, libraries that would
- change the behaviour of other packages, and other versions of Python. So only tests marked `gpu`,
- `source`, `assets`, `browser`, `library` and `python` may be skipped there.
+
+On CI, `VLAGENTS_FAIL_ON_SKIP=1` turns a skipped test into a failure. CI cannot install a GPU,
+sources and assets that are on no package index, a browser that apt lacks, libraries that would
+change the behaviour of other packages, and other versions of Python. So only tests marked `gpu`,
+`source`, `assets`, `browser`, `library` and `python` may be skipped there.
 """
 
 from __future__ import annotations
