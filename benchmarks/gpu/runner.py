@@ -30,21 +30,22 @@ from vlagents_ray.serve.python_env.child_start import die_with_parent
 
 _ROOT = Path(__file__).resolve().parents[2]
 _SPARE_S = 15.0  # minimum remaining time, s, with which a step is started
-_STACKS_S = (
-    # Time before the limit of a step, s, at which the stacks of all its threads are logged; Python
-    # may crash while it does this.
-    1.0
-)
+# Time before the limit of a step, s, at which the stacks of all its threads are logged; Python may
+# crash while it does this.
+_STACKS_S = 1.0
 
 
-def _child(plan: Plan, name: str, run: Callable[[Lab], None], limit_s: float) -> None:
-    """Run a step, as a process in a separate group."""
+def _child(plan: Plan, name: str, run: Callable[[Lab], None], until: float) -> None:
+    """Run a step, as a process in a separate group, which is killed at `until`, s of
+    `time.monotonic`.
+    """
     die_with_parent()
     os.setsid()
     log = os.open(plan.out / "gpu.log", os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     os.dup2(log, 1), os.dup2(log, 2)
     typer.echo(f"\n== {name}")
-    faulthandler.dump_traceback_later(max(0.1, limit_s - _STACKS_S), file=log)
+    left_s = until - time.monotonic()
+    faulthandler.dump_traceback_later(max(0.1, left_s - _STACKS_S), file=log)
     lab = Lab(plan, name)
     try:
         if plan.dry:
@@ -124,7 +125,8 @@ class Runner:
 
     def _start(self, name: str) -> BaseProcess:
         step = self._steps[name]
-        args = (self._plan, name, step.run, min(self._limit_s(step), self._left()))
+        until = time.monotonic() + min(self._limit_s(step), self._left())
+        args = (self._plan, name, step.run, until)
         process: BaseProcess = self._context.Process(target=_child, args=args)
         process.start()
         return process

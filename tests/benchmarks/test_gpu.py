@@ -30,6 +30,8 @@ from benchmarks.network import NetworkTimer, busy_time
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.policies.compilation import Compilation
 
+HANG_S = 10  # long enough for a step to begin on a busy machine
+
 
 def finds(lab: Lab) -> None:
     lab.show(rows=[{"rows": 1, "ms": 2.5}], note="a|b")
@@ -62,7 +64,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     plan = Plan(tmp_path_factory.mktemp("out"), tmp_path_factory.mktemp("scratch"), dry=True)
     steps = {"finds": finds, "misses": misses, "fails": fails, "dies": dies, "hangs": hangs}
     runner = Runner(
-        plan, {name: Step(run, 3 if run is hangs else 60) for name, run in steps.items()}
+        plan, {name: Step(run, HANG_S if run is hangs else 60) for name, run in steps.items()}
     )
     assert runner.run() is False
     assert (plan.out / "gpu.md").read_text().count("**no**") == 4
@@ -81,7 +83,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         ("misses", {"name": "ratio", "got": 0.5, "want": "at least 0.9", "passed": False}),
         ("fails", {"name": "runs to its end", "passed": False}),
         ("dies", {"name": "exit status", "got": -signal.SIGKILL, "passed": False}),
-        ("hangs", {"name": "ends in time", "got": "not within 3 s", "passed": False}),
+        ("hangs", {"name": "ends in time", "got": f"not within {HANG_S} s", "passed": False}),
     ],
 )
 def test_a_step_that_misses_fails_dies_or_hangs_costs_itself_alone(
@@ -331,8 +333,25 @@ def test_replays_beside_captures_report_which_of_them_failed(
     cuda = FakeCuda()
     cuda.install(monkeypatch)
     monkeypatch.setattr(probe, "fetch", lambda tensor: tensor.values.clone())
-    if not disturbs:
-        monkeypatch.setattr(cuda, "_require", lambda _: None)
+    acts = threading.Event()  # set once an act runs
+    acts_beside = threading.Event()  # set once an act runs while a graph is captured
+    require, run = cuda._require, cuda.run
+
+    def required(index: int) -> None:
+        if threading.current_thread() is not threading.main_thread():
+            acts.set()
+            if cuda.capture is not None:
+                acts_beside.set()
+        if disturbs:
+            require(index)
+
+    def ran(*arguments: Any) -> Any:
+        is_capturing = cuda.capture is not None and cuda.capture.thread == threading.get_ident()
+        assert not (is_capturing and acts.is_set()) or acts_beside.wait(60)
+        return run(*arguments)
+
+    monkeypatch.setattr(cuda, "_require", required)
+    monkeypatch.setattr(cuda, "run", ran)
     inputs = [cuda.tensor(torch.ones(2, 2)) for _ in range(2)]
     rows, errors = probe.replays_beside_captures(*inputs, operations=100, seconds=0.2)
     alone, beside = rows

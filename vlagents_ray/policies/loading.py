@@ -37,6 +37,8 @@ class LoadingReport:
     pads: bool = False
     # The number of rows of a forward pass -> the shortest duration so far, s.
     pass_s: dict[int, float] = field(default_factory=dict)
+    # Whether a batch is split into the passes with the shortest total time.
+    splits_by_time: bool = False
     # Called whenever a forward pass does not fit into memory, also after loading.
     on_out_of_memory: Callable[[], None] = lambda: None
     # Called with the time of each forward pass on a GPU.

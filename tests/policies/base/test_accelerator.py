@@ -6,6 +6,7 @@ import copy
 import os
 import re
 import sys
+import time
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -356,6 +357,8 @@ def made(kind: type[Crowded], **config: Any) -> Crowded:
     policy = kind.from_config({"checkpoint": "none", **config})
     policy.initialize()
     policy.model["passes"].clear()
+    # The durations of the passes depend on other processes.
+    policy.report.splits_by_time = False
     return policy
 
 
@@ -369,6 +372,34 @@ def acted(policy: Crowded, number: int, samples: int = 0) -> list[Act]:
     acts = policy.act_batch([view] * number, sessions)
     assert all(isinstance(act, Act) for act in acts)
     return acts  # type: ignore[return-value]
+
+
+class Timed(Roomy):
+    """A model whose passes take 1 s each on a fake clock, except one that takes 100 s."""
+
+    now_s = 0.0
+    delayed: tuple[int, int] | None = None  # (number of rows, how many such passes were before)
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        earlier = self.model["passes"].count(len(rows))
+        Timed.now_s += 100.0 if (len(rows), earlier) == self.delayed else 1.0
+        return super().predict(rows)
+
+
+@pytest.mark.parametrize("earlier", range(3))
+@pytest.mark.parametrize(("rows", "size"), [(2, 2), (5, 8)])
+def test_one_delayed_pass_while_a_model_loads_does_not_divide_later_batches(
+    monkeypatch: pytest.MonkeyPatch, rows: int, size: int, earlier: int
+) -> None:
+    """The first pass of a size also loads kernels; another process may delay any pass."""
+    monkeypatch.setattr(time, "perf_counter", lambda: Timed.now_s)
+    monkeypatch.setattr(Timed, "delayed", (size, earlier))
+    policy = Timed.from_config({"checkpoint": "none", "max_rows": 8, "batch_sizes": [1, 2, 8]})
+    policy.initialize()
+    assert policy.report.splits_by_time
+    policy.model["passes"].clear()
+    acted(policy, rows)
+    assert policy.model["passes"] == [size]
 
 
 def test_values_are_read_after_a_copy_that_does_not_wait_is_over(
@@ -480,7 +511,6 @@ def test_after_a_shortage_of_memory_the_passes_grow_again(
         now[0] += FIRST_WAIT_S - 1
     assert reached == [*limits[1:], 12, 12]
     policy.model["passes"].clear()
-    policy.report.pass_s.clear()  # otherwise two faster passes might be used instead
     acted(policy, 9)
     assert policy.model["passes"] == [9 if sizes is None else 12]
 

@@ -278,10 +278,10 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             if cores:
                 run_examples = partial(self._run_examples, size, seeds)
                 self.compilation.add_size(size, run_examples, defers=defers)
-            elif self.config.batch_sizes and self.report.accelerated:
-                # The first pass also loads kernels; only the duration of the second one is used.
+            else:
                 self._run_examples(size, seeds)
-            self._run_examples(size, seeds)
+        if self.config.batch_sizes and not self.compilation.deferred:
+            self._measure_passes(seeds)
 
         if sizes:
             free_memory()  # frees the memory of the full batch, which smaller batches do not need
@@ -293,7 +293,35 @@ class ModelPolicy(TrainableAgent, abc.ABC):
     def load_deferred(self) -> bool:
         """Compile the deferred cores for one batch size; return whether more sizes are left."""
         seeds = itertools.count()
-        return self.compilation.add_deferred(partial(self._run_examples, seeds=seeds))
+        is_left = self.compilation.add_deferred(partial(self._run_examples, seeds=seeds))
+        if not is_left:
+            self._measure_passes(seeds)
+        return is_left
+
+    def _measure_passes(self, seeds: Iterator[int]) -> None:
+        """Measure a forward pass of each batch size on an accelerator, so that later batches are
+        split into the fastest passes.
+
+        The durations of earlier passes do not count: they include the loading of kernels, or are
+        those of cores whose compilation was deferred.
+        """
+        is_compiled = self.compilation.mode and self.compilation.cores
+        if not (self.report.accelerated or is_compiled):
+            return
+        sizes = self.config.batch_sizes or []
+        pass_s = self.report.pass_s
+        pass_s.clear()
+        self.report.splits_by_time = False
+        for size in sizes:
+            self._run_rows(size, seeds)
+
+        # A pass that seems slower than several smaller ones may have been delayed by another
+        # process.
+        fits = [size for size in sizes if size in pass_s]
+        for size in fits:
+            if len(fastest_split(size, tuple((one, pass_s[one]) for one in fits))) > 1:
+                self._run_rows(size, seeds)
+        self.report.splits_by_time = self.report.accelerated
 
     def _decide_on_compiling(self) -> None:
         """Resolve the setting `compile` for the loaded model and its device."""
@@ -654,16 +682,13 @@ class ModelPolicy(TrainableAgent, abc.ABC):
 
         sizes = [size for size in self.config.batch_sizes or () if size <= self.most_rows]
         pass_s = {size: self.report.pass_s.get(size) for size in sizes}
-        if self.report.accelerated and pass_s and None not in pass_s.values():
+        if self.report.splits_by_time and pass_s and None not in pass_s.values():
             return split + fastest_split(remaining, tuple(pass_s.items()))
         return [*split, remaining]
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
         """Run a forward pass with `size` random rows, and raise its first error."""
-        rows = [self._example(next(seeds)) for _ in range(size)]
-        for prediction in self._forward(rows):
-            if isinstance(prediction, Exception):
-                raise prediction
+        rows = self._run_rows(size, seeds)
         if any("jax" in device for device in self.report.devices) and size <= self.most_rows:
             # JAX compiles a separate program for each number of rows and each smaller number of
             # observations.
@@ -673,6 +698,16 @@ class ModelPolicy(TrainableAgent, abc.ABC):
                 samples = [drawn(rows[0], row.rng) for row in rows[observations:]]
                 # `_forward` is not called, since it would record the durations of these passes.
                 self.predict([*rows[:observations], *samples])
+
+    def _run_rows(self, size: int, seeds: Iterator[int]) -> list[Row]:
+        """Run a forward pass with `size` random rows, which are returned, and raise its first
+        error.
+        """
+        rows = [self._example(next(seeds)) for _ in range(size)]
+        for prediction in self._forward(rows):
+            if isinstance(prediction, Exception):
+                raise prediction
+        return rows
 
     def observations_of(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
         """Return which rows to encode.
