@@ -1,4 +1,6 @@
-"""Signal handlers: Ctrl-C and SIGTERM in a command, and a flag that requests a stop."""
+"""Signal handlers: signals that end a command or a program that drives a robot, and a flag that
+requests a stop.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +11,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from types import FrameType
 
 _FIRST_WAKE_S = 0.05  # time for the main thread to run a handler by itself
@@ -18,6 +21,8 @@ _POLL_S = 0.02  # period of `StopRequest.wait`
 # The signals whose handlers end a command or restart a robot.
 _DELIVERED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 _WAKE = signal.SIGURG  # a signal that processes ignore by default
+# The signals that end a program: Ctrl-C, and the signals of systemd and of a closed terminal.
+END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequest:
@@ -157,11 +162,19 @@ class _Waker:
             delay_s = min(2 * delay_s, _LONGEST_WAKE_S)
 
 
+@dataclass(frozen=True, slots=True)
+class _Ending:
+    """A signal that ends the program, and the exception that its handler has raised."""
+
+    number: int
+    error: BaseException
+
+
 class _Process:
     """The contexts that the main thread has entered."""
 
     def __init__(self) -> None:
-        self.interrupted = StopRequest()  # within `interrupts`
+        self.ending: _Ending | None = None  # within `interrupts` and `ended_by_signals`
         self.stop: StopRequest | None = None  # flag of the innermost `stop_signals`
         self.call: _RaisingCall | None = None
         self.waker: _Waker | None = None
@@ -200,40 +213,91 @@ def interrupts() -> Iterator[None]:
     """Raise `KeyboardInterrupt` on Ctrl-C and SIGTERM within the context, and record the signal.
 
     Python drops an exception that a handler raises while a destructor or a callback of Ray's C code
-    runs. In that case, `raise_dropped_interrupt` raises it later. Outside of the main thread, where
-    Python delivers no signals, this does nothing.
+    runs. In that case, `raise_dropped` raises it later. Outside of the main thread, where Python
+    delivers no signals, this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def on_signal(number: int, frame: FrameType | None) -> None:
-        _process.interrupted.set()
+        _process.ending = _Ending(number, KeyboardInterrupt())
         signal.default_int_handler(number, frame)
 
+    numbers = (signal.SIGINT, signal.SIGTERM)
     with delivered():
-        before = {
-            number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
-        }
+        before = {number: signal.signal(number, on_signal) for number in numbers}
         try:
             yield
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-            _process.interrupted.clear()
+            _forget_ending(*numbers)
+
+
+@contextlib.contextmanager
+def ended_by_signals(*numbers: signal.Signals) -> Iterator[None]:
+    """Raise an exception at these signals within the context: `KeyboardInterrupt` at SIGINT,
+    otherwise `SystemExit` with the status 128 + the number of the signal.
+
+    A program that drives a robot uses this, so that the robot is stopped before the program ends.
+    Further signals with the same number are ignored, since they would interrupt the stop. If Python
+    drops the exception, `raise_dropped` raises it later. Ignored signals (such as SIGHUP under
+    nohup) and the caller's own handlers are unchanged. Outside the main thread, where Python cannot
+    set handlers, no handler is changed.
+    """
+    replaced: list[int] = []
+    if threading.current_thread() is threading.main_thread():
+        replaced = [number for number in numbers if _is_default(signal.getsignal(number))]
+
+    def on_signal(number: int, _: object) -> None:
+        signal.signal(number, signal.SIG_IGN)
+        is_interrupt = number == signal.SIGINT
+        error = KeyboardInterrupt() if is_interrupt else SystemExit(128 + number)
+        _process.ending = _Ending(number, error)
+        raise error
+
+    with contextlib.ExitStack() as undo:
+        if replaced:
+            undo.enter_context(delivered())
+            undo.callback(_forget_ending, *replaced)
+        for number in replaced:
+            undo.callback(signal.signal, number, signal.getsignal(number))
+            signal.signal(number, on_signal)
+        yield
+
+
+def _is_default(handler: object) -> bool:
+    """Return whether a program has not set this handler itself.
+
+    `ray.init` sets a handler of SIGTERM. After `ray.shutdown`, Python still reports that handler,
+    but the signal ends the process at once (Ray 2.60).
+    """
+    if handler in (signal.SIG_DFL, signal.default_int_handler):
+        return True
+    module: str = getattr(handler, "__module__", None) or ""
+    return module.partition(".")[0] == "ray"
+
+
+def _forget_ending(*numbers: int) -> None:
+    """Forget the signal that ends the program if it is one of these."""
+    if _process.ending is not None and _process.ending.number in numbers:
+        _process.ending = None
 
 
 def is_interrupted() -> bool:
-    """Return whether Ctrl-C or SIGTERM has arrived within `interrupts`."""
-    return _process.interrupted.is_set()
-
-
-def raise_dropped_interrupt() -> None:
-    """Raise `KeyboardInterrupt` if a signal arrived within `interrupts` and its exception was
-    dropped.
+    """Return whether a signal that ends the program has arrived within `interrupts` or
+    `ended_by_signals`.
     """
-    if _process.interrupted.is_set():
-        raise KeyboardInterrupt
+    return _process.ending is not None
+
+
+def raise_dropped() -> None:
+    """Raise the exception of a signal that ends the program again, if Python may have dropped it:
+    if the signal has arrived within `interrupts` or `ended_by_signals`, and the context continues.
+    """
+    if _process.ending is not None:
+        raise _process.ending.error
 
 
 @contextlib.contextmanager
@@ -262,7 +326,7 @@ def stop_signals() -> Iterator[StopRequest]:
     A handler that only sets a flag cannot interrupt a transaction. Outside the main thread, where
     Python delivers no signals, the flag is never set.
     """
-    raise_dropped_interrupt()
+    raise_dropped()
     stop = StopRequest()
     if threading.current_thread() is not threading.main_thread():
         yield stop

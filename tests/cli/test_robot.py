@@ -332,7 +332,7 @@ def test_the_command_stops_the_robot_when_it_is_told_to_end(wish: signal.Signals
 import time
 import vlagents_ray.cli.robot as command
 
-def run(options, end_signal):
+def run(options):
     try:
         print("moving", flush=True)
         time.sleep(60)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs, PlayerSettings
-from vlagents_ray.robot import run_loop
-from vlagents_ray.robot.end_signal import ended_by_signals
+from vlagents_ray.robot import Guard, LoopOptions, MotionLimits, run_loop
+from vlagents_ray.signals import END_SIGNALS, ended_by_signals, interrupts, raise_dropped
 
-ENDING = [signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1]
+ENDING = [*END_SIGNALS, signal.SIGUSR1]
 
 PROGRAM = """
 from test_end_signal import Arm, Still
@@ -36,6 +39,22 @@ class Loud(Arm):
 
 run_loop(Loud(), Still(), hz=50, seconds=60)
 """
+
+
+# A program that has used Ray before it drives its arm.
+PROGRAM_WITH_RAY = f"""
+import ray
+from vlagents_ray.ray_tools.session import joined
+
+with joined("local", num_cpus=1):
+    pass
+{PROGRAM}
+"""
+
+
+def default_handler(number: int) -> Any:
+    """Return the handler of a signal in a new Python process."""
+    return signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
 
 
 class Still(Agent):
@@ -71,34 +90,116 @@ def test_a_signal_ends_a_loop_of_a_users_own_program_and_stops_the_robot(
 ) -> None:
     """The robot is stopped before the process ends; it must not stay in motion."""
     arm, agent = Arm(number), Still()
-    before = signal.signal(number, signal.SIG_DFL)
+    default = default_handler(number)
+    before = signal.signal(number, default)
     try:
         with (
-            pytest.raises(SystemExit) as ended,
+            pytest.raises((SystemExit, KeyboardInterrupt)) as ended,
             ChunkPlayer(agent, PlayerSettings(mode="async")) as player,
         ):
             run_loop(arm, player if is_player else agent, hz=200, seconds=60)
-        assert signal.getsignal(number) is signal.SIG_DFL
+        assert signal.getsignal(number) is default
     finally:
         signal.signal(number, before)
-    assert ended.value.code == 128 + number
+    if number != signal.SIGINT:
+        assert isinstance(ended.value, SystemExit)
+        assert ended.value.code == 128 + number
     assert (arm.commands, arm.stops) == (3, 1)
 
 
-def test_the_process_ends_with_the_status_of_the_signal_after_the_stop() -> None:
+class SendsSignal:
+    """Python drops the exception of the signal's handler, which runs in this destructor."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        self.number = number
+
+    def __del__(self) -> None:
+        signal.raise_signal(self.number)
+
+
+class Interrupted(Arm):
+    """An arm whose driver is interrupted in a destructor at a call of `place`, in the run or on the
+    way to the rest pose.
+    """
+
+    def __init__(self, number: signal.Signals, place: str, *, at_rest: bool) -> None:
+        super().__init__()
+        self.sends, self.place, self.at_rest = number, place, at_rest
+        self.calls = 0
+        self.commands_at_signal: int | None = None
+
+    def _called(self, place: str) -> None:
+        if place != self.place:
+            return
+        self.calls += 1
+        # The run has 5 ticks, and the way to the rest pose many more.
+        if self.calls == (9 if self.at_rest else 3):
+            self.commands_at_signal = self.commands
+            SendsSignal(self.sends)
+
+    def observe(self) -> Obs:
+        self._called("observe")
+        return super().observe()
+
+    def apply(self, action: np.ndarray) -> None:
+        super().apply(action)
+        self._called("apply")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("at_rest", [False, True])
+@pytest.mark.parametrize("place", ["observe", "apply"])
+@pytest.mark.parametrize(
+    ("number", "context"),
+    [
+        *((number, contextlib.nullcontext) for number in ENDING),
+        *((number, partial(ended_by_signals, *END_SIGNALS)) for number in END_SIGNALS),
+        *((number, interrupts) for number in (signal.SIGINT, signal.SIGTERM)),
+    ],
+)
+def test_nothing_is_commanded_after_a_signal_whose_exception_python_drops(
+    number: signal.Signals,
+    context: Callable[[], contextlib.AbstractContextManager[None]],
+    place: str,
+    *,
+    at_rest: bool,
+) -> None:
+    arm = Interrupted(number, place, at_rest=at_rest)
+    limits = MotionLimits(velocity=1.0, acceleration=5.0, rest=(0.5, 0.5))
+    guard = Guard(Still.contract, limits=limits, hz=200)
+    before = signal.signal(number, default_handler(number))
+    try:
+        with context(), pytest.raises((SystemExit, KeyboardInterrupt)):
+            run_loop(arm, Still(), hz=200, seconds=5 / 200, options=LoopOptions(guard=guard))
+        with ended_by_signals(number):
+            raise_dropped()  # raises nothing: the signal of the earlier program is forgotten
+    finally:
+        signal.signal(number, before)
+    assert arm.commands_at_signal is not None
+    assert (arm.commands, arm.stops) == (arm.commands_at_signal, 1)
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        pytest.param(PROGRAM, id="robot"),
+        pytest.param(PROGRAM_WITH_RAY, id="after Ray", marks=[pytest.mark.ray, pytest.mark.slow]),
+    ],
+)
+def test_the_process_ends_with_the_status_of_the_signal_after_the_stop(program: str) -> None:
     with subprocess.Popen(
-        [sys.executable, "-c", PROGRAM],
+        [sys.executable, "-c", program],
         cwd=os.path.dirname(__file__),
         stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
+        stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGTERM)
-        said = process.stdout.read()
-        assert process.wait(30) == 143
+        said, _ = process.communicate(timeout=30)
+        assert process.returncode == 143
     assert said == "the arm stops\n"
 
 

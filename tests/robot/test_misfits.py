@@ -22,7 +22,6 @@ from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.robot import evaluate_on_robot
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot import run_loop
-from vlagents_ray.robot.end_signal import EndSignal
 
 RANGE = {"min": [-1.0, 0.2], "max": [0.1, 1.0]}
 RIGHT: dict[str, Any] = {
@@ -138,7 +137,7 @@ def by_the_command(case: Case, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "RemoteAgent", lambda *_, **__: Policy(case))
         patch.setitem(sys.modules, __name__, sys.modules[Arm.__module__])
-        command._run(command.parse([*options, "--mode", "open_loop"]), EndSignal())
+        command._run(command.parse([*options, "--mode", "open_loop"]))
     assert Arm.closed == 1
 
 

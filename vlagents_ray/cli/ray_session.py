@@ -21,7 +21,7 @@ from vlagents_ray.cli.console import err, say_error
 from vlagents_ray.errors import ClusterLost, ConfigError
 from vlagents_ray.ray_tools.private import LOGGERS, node_of_this_process
 from vlagents_ray.ray_tools.session import started_here
-from vlagents_ray.signals import is_interrupted, raise_dropped_interrupt
+from vlagents_ray.signals import is_interrupted, raise_dropped
 
 log = logging.getLogger(__name__)
 
@@ -281,7 +281,7 @@ class RayLoss:
         """
         try:
             while not self._lost.wait(_LOOK_S):
-                raise_dropped_interrupt()
+                raise_dropped()
         except KeyboardInterrupt:
             self.ending.set()
             # `faulthandler` also prints the stacks of all threads.

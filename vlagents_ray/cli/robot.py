@@ -37,7 +37,6 @@ from vlagents_ray.errors import ConfigError, VLAgentsError, printable
 from vlagents_ray.interface import Agent
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import entries, names, not_installed, pip_install, registered_function
-from vlagents_ray.robot.end_signal import END_SIGNALS, EndSignal, ended_by_signals
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.guard import SOFT_START_S, Guard, measured_state
 from vlagents_ray.robot.leaders import Leader, OpenLeader, leader_named
@@ -58,6 +57,7 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.terminal import typed_keys
 from vlagents_ray.robot.watchdog import Watchdog
+from vlagents_ray.signals import END_SIGNALS, ended_by_signals
 from vlagents_ray.slo import SHARE, Slo
 from vlagents_ray.viewers import open_viewer
 
@@ -100,8 +100,8 @@ def main(arguments: Sequence[str]) -> int:
 
         return drive(options)
     try:
-        with ended_by_signals(*END_SIGNALS, signal.SIGINT) as end_signal:
-            report = _run(options, end_signal)
+        with ended_by_signals(*END_SIGNALS):
+            report = _run(options)
     except KeyboardInterrupt:
         print(error_line("interrupted"), file=sys.stderr)  # noqa: T201
         return 128 + signal.SIGINT
@@ -120,7 +120,7 @@ def _run_subcommand(name: str, arguments: Sequence[str]) -> int:
     except VLAgentsError as error:
         print(printable(error_line(f"{type(error).__name__}: {error}")), file=sys.stderr)  # noqa: T201
         return 2
-    with ended_by_signals(*END_SIGNALS, signal.SIGINT):
+    with ended_by_signals(*END_SIGNALS):
         return run(arguments)
 
 
@@ -168,11 +168,8 @@ def _say(line: str) -> None:
     print(printable(line), flush=True)  # noqa: T201
 
 
-def _run(options: argparse.Namespace, end_signal: EndSignal) -> LoopReport:
-    """Connect to the policy, open the robot, run the control loop, and print the report.
-
-    A signal that has arrived ends the loop before its next tick.
-    """
+def _run(options: argparse.Namespace) -> LoopReport:
+    """Connect to the policy, open the robot, run the control loop, and print the report."""
     say = _say
     hz = options.hz or _HZ
     report = LoopReport(hz)
@@ -222,7 +219,6 @@ def _run(options: argparse.Namespace, end_signal: EndSignal) -> LoopReport:
         watchdog = stack.enter_context(_watched(robot, limits_s, keys, say))
 
         def is_over() -> bool:
-            end_signal.raise_if_received()
             keys.say_restart()
             return keys.over or _is_task_done(robot)
 

@@ -51,7 +51,6 @@ from vlagents_ray.interface import (
 )
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import names, not_installed, registered_class
-from vlagents_ray.robot.end_signal import END_SIGNALS, ended_by_signals
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.guard import Guard
 from vlagents_ray.robot.limits import MotionLimits
@@ -59,6 +58,7 @@ from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.settings import require_arguments
+from vlagents_ray.signals import END_SIGNALS, ended_by_signals, raise_dropped
 from vlagents_ray.slo import Slo, read_answer
 from vlagents_ray.viewers import EpisodeViewer, LoopView
 
@@ -582,12 +582,12 @@ def run_loop(
     )
 
     def is_over() -> bool:
-        end_signal.raise_if_received()
+        raise_dropped()  # also ends a run that commands nothing
         return until()
 
     with contextlib.ExitStack() as stack:
         # SIGUSR1 restarts a robot of the command, and may be sent to any program that drives one.
-        end_signal = stack.enter_context(ended_by_signals(*END_SIGNALS, signal.SIGUSR1))
+        stack.enter_context(ended_by_signals(*END_SIGNALS, signal.SIGUSR1))
         control.begin(auto=restart == "auto")
         try:
             obs = _observed(robot)
@@ -889,10 +889,13 @@ class _Run:
     def _command(self, action: np.ndarray) -> Held | None:
         """Apply an action, unless the robot has been stopped since this tick's check; return the
         reason if the action was not applied.
+
+        After a signal that ends the program, no action is applied.
         """
         with self.control.command() as hold:
             if hold is not None:
                 return hold
+            raise_dropped()
             self.standing = False
             self.last = action
 

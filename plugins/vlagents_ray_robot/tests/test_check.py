@@ -1,5 +1,6 @@
 """Tests of the check of a robot: five sound arms pass, and twenty faults are found before harm."""
 
+import signal
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -11,6 +12,8 @@ from arm_models import ARMS, model_file, simulated_arm
 from faulty_arms import FAULTS, ClockStep, Fault, FaultyArm, QuaternionOrder
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import Obs
+from vlagents_ray.signals import ended_by_signals
 from vlagents_ray.testing import ContractViolation
 from vlagents_ray_robot.check import CHECKS, Operator, RobotReport, examine
 from vlagents_ray_robot.check_command import main
@@ -235,3 +238,35 @@ def test_without_a_terminal_nothing_is_agreed(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr("builtins.input", closed)
     assert not Operator(move=True).agrees("a move")
+
+
+class SendsSignal:
+    """Python drops the exception of the signal's handler, which runs in this destructor."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+class Interrupted(Counting):
+    """An arm whose driver is interrupted in a destructor while it moves."""
+
+    commands_at_signal: int | None = None
+
+    def observe(self) -> Obs:
+        if self.commands > 20 and self.commands_at_signal is None:
+            self.commands_at_signal = self.commands
+            SendsSignal()
+        return super().observe()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_nothing_is_commanded_after_a_signal_whose_exception_python_drops() -> None:
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        with closing(simulated_arm("franka")) as arm, ended_by_signals(signal.SIGTERM):
+            interrupted = Interrupted(arm)
+            with pytest.raises(SystemExit):
+                examine(interrupted, operator=SimulatedOperator(arm), clock=arm.clock)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert interrupted.commands == interrupted.commands_at_signal

@@ -16,6 +16,7 @@ from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.images.jpeg_png import data_url, encode_jpeg
 from vlagents_ray.interface import CAPTURED, Obs
 from vlagents_ray.robot.loop import Robot, contract_of
+from vlagents_ray.signals import raise_dropped
 from vlagents_ray.validation import check_observation
 
 CHECKS = {  # in the order in which they run
@@ -438,6 +439,7 @@ class _Suite:
 
     def _apply(self, action: np.ndarray) -> None:
         """Command an action, and check that `apply` does not wait."""
+        raise_dropped()  # after a signal that ends the program, nothing moves
         self._command = action
         began_s = self._clock.monotonic()
         self._robot.apply(action.astype(np.float32))
