@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-import select
 import socket
 import ssl
 import threading
@@ -30,7 +29,7 @@ from vlagents_ray.client.credentials import (
     require_plain,
     tls_failure,
 )
-from vlagents_ray.client.http_deadline import DeadlineSocket
+from vlagents_ray.client.http_connection import ServerConnection
 from vlagents_ray.client.transports.base import (
     AVOIDED_S,
     DIRECT_S,
@@ -61,7 +60,8 @@ from vlagents_ray.errors import (
     UnknownApp,
     VLAgentsError,
 )
-from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_requests, read_error
+from vlagents_ray.protocol.frame_layout import Buffer
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, read_error, request_parts
 from vlagents_ray.protocol.json_messages import PROBLEM_TYPE
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
@@ -210,7 +210,7 @@ class HttpTransport:
             "content-type": CONTENT_TYPE,
             "accept": CONTENT_TYPE,
         }
-        frame = encode_requests(requests, self._codec.codec_for(requests[0].obs))
+        frame = request_parts(requests, self._codec.codec_for(requests[0].obs))
         deadline = time.monotonic() + timeout_s
         op = requests[0].op
         answer = self._call_direct(op, frame, headers, deadline)
@@ -290,7 +290,7 @@ class HttpTransport:
         self._session, self._answered_by = session, answered_by
 
     def _call_direct(
-        self, op: str, frame: bytes, headers: dict[str, str], deadline: float
+        self, op: str, frame: Sequence[Buffer], headers: dict[str, str], deadline: float
     ) -> tuple[int, str, bytes] | None:
         """Send a request to the replica's own port; return None if it was not executed there, so
         that it may be sent to the server's port.
@@ -390,16 +390,16 @@ class _Link:
         self.url = url
         self._watch = watch or ReplicaWatch()
         self._credentials = credentials
-        self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
+        self._connection: ServerConnection | None = None
+        self._path = url.path.rstrip("/")
         self.alternate = ""  # the header `Link` of the last answer
-        self._poller = select.poll()  # polls the socket of the connection
         self._answers_fast = True  # whether the last answer was immediate
 
     def exchange(
         self,
         method: str,
         path: str,
-        body: bytes | None,
+        body: Sequence[Buffer] | None,
         headers: dict[str, str],
         timeout_s: float,
         probe: Callable[[], bool] | None = None,
@@ -407,6 +407,7 @@ class _Link:
         """Send a request; return the status, content type and body of the answer.
 
         Args:
+            body: Consecutive pieces of the body; None if the request has no body.
             probe: Pings the replica, and returns whether it is alive. It is called on other
                 threads, as one connection carries one request at a time. If it is None, the replica
                 is not watched.
@@ -416,15 +417,18 @@ class _Link:
             ConnectionLost: The connection broke, or the client left the replica.
             DeadlineExceeded: There was no answer in time.
         """
-        begun = time.monotonic()
-        connection, deadline_socket = self.open(timeout_s)
-        deadline_socket.begin_exchange(timeout_s - (time.monotonic() - begun))
+        deadline = time.monotonic() + timeout_s
+        connection = self.open(timeout_s)
         try:
-            target = self.url.path.rstrip("/") + path
-            with deadline_socket.sending_at_once():
-                connection.request(method, target, body, headers | self._credentials.headers)
-            self._await_answer(connection.sock, begun + timeout_s, probe)
-            answer = connection.getresponse()
+            connection.send(
+                method,
+                self._path + path,
+                headers | self._credentials.headers,
+                body,
+                deadline - time.monotonic(),
+            )
+            self._await_answer(connection, deadline, probe)
+            answer = connection.receive(method)
 
             content = answer.read(DEFAULT_LIMITS.body_bytes + 1)
             if len(content) > DEFAULT_LIMITS.body_bytes:
@@ -433,6 +437,8 @@ class _Link:
                     f"{self.url.geturl()}: expected the answer of a policy server, got more than "
                     f"{DEFAULT_LIMITS.body_bytes} bytes; check the URL"
                 )
+            if answer.will_close:
+                self.close()
             self.alternate = answer.headers.get("link", "")
             return answer.status, answer.headers.get("content-type", ""), content
         except ReplicaSilent:
@@ -451,41 +457,29 @@ class _Link:
             reason = f"{type(error).__name__}: {error}"
             raise connection_lost(self.url.geturl(), reason) from error
 
-    def open(self, timeout_s: float) -> tuple[http.client.HTTPConnection, DeadlineSocket]:
+    def open(self, timeout_s: float) -> ServerConnection:
         """Return the connection, and connect if it is closed.
 
         Raises:
             NoReplica: The address cannot be reached.
         """
-        if self._connection is not None and _closed_by_peer(self._connection[0].sock):
+        if self._connection is not None and not self._connection.is_open:
             self.close()
 
         if self._connection is None:
-            host, port = self.url.hostname or "", self.url.port
             context = self._credentials.context(self.url.geturl())
-            if context is None:
-                connection = http.client.HTTPConnection(host, port, timeout=timeout_s)
-            else:
-                connection = http.client.HTTPSConnection(
-                    host, port, timeout=timeout_s, context=context
-                )
             try:
-                connection.connect()
+                self._connection = ServerConnection(self.url, context, timeout_s)
             except ssl.SSLError as error:
                 raise tls_failure(self.url.geturl(), error) from error
             except OSError as error:
                 raise no_replica(self.url.geturl(), error) from error
-            connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._poller = select.poll()
-            self._poller.register(connection.sock, select.POLLIN)
-            self._connection = connection, DeadlineSocket.install(connection)
         return self._connection
 
     def close(self) -> None:
         """Close the connection."""
         if self._connection is not None:
-            connection, _ = self._connection
-            connection.close()
+            self._connection.close()
             self._connection = None
 
     def is_alive(self) -> bool:
@@ -499,7 +493,7 @@ class _Link:
         return False
 
     def _await_answer(
-        self, sock: socket.socket, deadline: float, probe: Callable[[], bool] | None
+        self, connection: ServerConnection, deadline: float, probe: Callable[[], bool] | None
     ) -> None:
         """Wait for the first byte of an answer, and poll for it at first if the last one was
         immediate.
@@ -509,7 +503,7 @@ class _Link:
         watch = ReplicaWatch() if probe is None else self._watch
         watch.begin()
         ping = None if probe is None else partial(watch.probe, probe)
-        await_answer(self._poller, sock, spin_until, deadline, watch, ping)
+        await_answer(connection.poller, connection.sock, spin_until, deadline, watch, ping)
         watch.received()
         self._answers_fast = time.perf_counter() - begun < FAST_S
 
@@ -611,17 +605,6 @@ def http_url(url: str) -> SplitResult:
             f"url: expected http(s)://HOST:PORT, ws(s)://HOST:PORT or serve://APP, got {url!r}"
         )
     return parts._replace(scheme=scheme)
-
-
-def _closed_by_peer(sock: socket.socket | None) -> bool:
-    """Return whether the server has closed an idle connection; the socket of a closed connection is
-    readable.
-    """
-    if sock is None:
-        return True
-    poller = select.poll()
-    poller.register(sock, select.POLLIN)
-    return bool(poller.poll(0))
 
 
 def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:

@@ -9,15 +9,14 @@ import base64
 import http.client
 import json
 import re
-import select
-import socket
+import ssl
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 import numpy as np
 
-from vlagents_ray.client.http_deadline import DeadlineSocket
+from vlagents_ray.client.http_connection import ServerConnection
 from vlagents_ray.errors import (
     ConnectionLost,
     InvalidObservation,
@@ -48,7 +47,7 @@ class HttpClient(UpstreamClient):
         self._headers = {"Content-Type": self.media_type, "Accept": self.media_type}
         if options.key is not None:
             self._headers["Authorization"] = f"Bearer {options.key}"
-        self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
+        self._connection: ServerConnection | None = None
 
     @abc.abstractmethod
     def encode(self, observation: Mapping[str, Any]) -> bytes:
@@ -61,17 +60,8 @@ class HttpClient(UpstreamClient):
     @property
     def is_open(self) -> bool:
         """Whether the connection is open, as far as this process knows."""
-        if self._connection is None:
-            return False
-        connection, _ = self._connection
-        if connection.sock is None:
-            return False
-        if isinstance(connection, http.client.HTTPSConnection):
-            return True  # readable data may be a TLS session ticket
-        # uvicorn closes a connection that is idle for 5 s, which makes it readable.
-        poller = select.poll()
-        poller.register(connection.sock, select.POLLIN)
-        return not poller.poll(0)
+        # uvicorn closes a connection that is idle for 5 s.
+        return self._connection is not None and self._connection.is_open
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Connect, and return the upstream's metadata, if the protocol has some."""
@@ -90,18 +80,11 @@ class HttpClient(UpstreamClient):
 
     def _open(self, timeout_s: float) -> None:
         """Open a connection."""
-        is_secure = self._url.scheme == "https"
-        cls = http.client.HTTPSConnection if is_secure else http.client.HTTPConnection
-        connection = cls(self._url.hostname or "", self._url.port, timeout=timeout_s)
+        context = ssl.create_default_context() if self._url.scheme == "https" else None
         try:
-            connection.connect()
+            self._connection = ServerConnection(self._url, context, timeout_s)
         except OSError as error:
-            connection.close()
             raise self.unreachable(error) from error
-
-        connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.auto_open = 0
-        self._connection = connection, DeadlineSocket.install(connection)
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
@@ -113,11 +96,10 @@ class HttpClient(UpstreamClient):
             raise self.closed()
 
         max_bytes = self.options.limits.body_bytes
-        connection, deadline_socket = self._connection
-        deadline_socket.begin_exchange(self.options.timeout_s)
+        pieces = None if content is None else [content]
         try:
-            connection.request(method, path, content, self._headers)
-            response = connection.getresponse()
+            self._connection.send(method, path, self._headers, pieces, self.options.timeout_s)
+            response = self._connection.receive(method)
             body = response.read(max_bytes + 1)
         except (http.client.HTTPException, OSError) as error:
             raise self.lost(error) from error
@@ -140,8 +122,7 @@ class HttpClient(UpstreamClient):
 
     def close(self) -> None:
         if self._connection is not None:
-            connection, _ = self._connection
-            connection.close()
+            self._connection.close()
             self._connection = None
 
 
