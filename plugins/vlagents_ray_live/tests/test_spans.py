@@ -4,6 +4,7 @@ batch.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -18,6 +19,8 @@ from opentelemetry.trace import SpanKind, StatusCode
 from vlagents_ray import Obs, RemoteAgent, tracing
 from vlagents_ray.errors import InvalidObservation, VLAgentsError
 from vlagents_ray.interface import Act, Agent
+from vlagents_ray.serve.requests import PendingRequest
+from vlagents_ray_live import spans
 
 OBS = Obs(state={"joints": np.zeros(3, np.float32)})
 
@@ -54,10 +57,19 @@ def children(spans: list[ReadableSpan], parent: ReadableSpan) -> list[ReadableSp
     return sorted(found, key=lambda one: one.start_time)
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.05])
 @pytest.mark.parametrize("transport", ["http", "websocket"])
 def test_a_request_is_one_trace_from_the_program_to_the_batch(
-    exporter: InMemorySpanExporter, transport: str
+    exporter: InMemorySpanExporter, monkeypatch: pytest.MonkeyPatch, transport: str, late_s: float
 ) -> None:
+    """Other observers, or a busy machine, may delay the observer of a request."""
+    observe = spans.RequestSpans.on_request
+
+    def observe_late(observer: spans.RequestSpans, pending: PendingRequest) -> None:
+        time.sleep(late_s)
+        observe(observer, pending)
+
+    monkeypatch.setattr(spans.RequestSpans, "on_request", observe_late)
     with (
         live_server(Picky()) as server,
         RemoteAgent(server.url, transport=transport) as agent,

@@ -69,7 +69,8 @@ class RequestSpans(Observer):
         traceparent = "" if obs is None else obs.info.get(tracing.TRACEPARENT, "")
         if not isinstance(traceparent, str):  # the client may send a value of any type
             traceparent = ""
-        pending.observer_data[self] = traceparent[:_TEXT], time.time_ns()
+        # The durations of the stages count from this time. The observer may be called later.
+        pending.observer_data[self] = traceparent[:_TEXT], _since_1970_ns(pending.arrived)
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Keep the data of the answered request for `export`."""
@@ -147,6 +148,12 @@ class Spans(ReplicaPart):
         """Return the observer of requests; None without traces."""
         tracer = tracing.tracer()
         return None if tracer is None else RequestSpans(tracer, self.context.short_name)
+
+
+def _since_1970_ns(at: float) -> int:
+    """Return a past time of `time.perf_counter`, s, as ns since 1970."""
+    now_ns, now = time.time_ns(), time.perf_counter()
+    return now_ns - int((now - at) * 1e9)
 
 
 def _ns(milliseconds: float) -> int:
