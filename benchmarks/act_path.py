@@ -22,7 +22,7 @@ import typer
 
 import vlagents_ray
 from benchmarks.calls import CallCounter, CountedNoop, counted
-from benchmarks.console import Out, Transports, save, show_skipped
+from benchmarks.console import Out, TableOfPage, Transports, save, show_skipped
 from benchmarks.figures import measured_on
 from benchmarks.further_tables import replace_rows
 from benchmarks.own_clients import OwnClient, connect, observation
@@ -190,10 +190,7 @@ def trace_acts(clients: Sequence[OwnClient], acts: int) -> list[dict[str, Any]]:
 def main(
     acts: Annotated[int, typer.Option(min=1, help="Number of calls that are counted.")] = 200,
     transports: Transports = "",
-    table_of_page: Annotated[
-        bool,
-        typer.Option("--table", help="Write the table of docs/measured_tables.md again."),
-    ] = False,
+    table_of_page: TableOfPage = False,
     out_file: Out = None,
 ) -> None:
     """Show the files and classes of this project that one inference call enters, its calls of

@@ -23,7 +23,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,9 +31,10 @@ from typing import Any
 import typer
 
 from benchmarks import peers as others
-from benchmarks.console import Calls, Out, save, show_round_trips, show_use
+from benchmarks.console import Calls, Out, TableOfPage, save, show_round_trips, show_use
 from benchmarks.drivers import START_S, ClientProcess, ProcessDriver
 from benchmarks.figures import measured_on
+from benchmarks.further_tables import replace_rows
 from benchmarks.line_client import obey, timed
 from benchmarks.own_clients import OwnClient, observation
 from benchmarks.round_trips import LOOPBACK, StartClient, measure
@@ -47,7 +48,7 @@ from vlagents_ray.serve.ports import free_port
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
-DIRECT, PROXIED = "bare HTTP application", "bare HTTP application behind HAProxy"
+BARE = DIRECT, PROXIED = "bare HTTP application", "bare HTTP application behind HAProxy"
 OWN = (OwnClient("http", "jpeg"), OwnClient("websocket", "jpeg"))
 _COMMAND = (sys.executable, "-m", "benchmarks.http_floor")
 
@@ -204,8 +205,28 @@ def measure_floor(calls: int, peers_python: Path) -> dict[str, Any]:
     return trips.to_json() | {"versions": versions}
 
 
+def page_table(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Return the table of docs/measured_tables.md: its headings, and a row for each way.
+
+    Args:
+        found: The result of `measure_floor`.
+    """
+    head = ["", "median ms", "/ bare HTTP", "/ bare HTTP behind HAProxy", "client CPU ms", "server CPU ms"]
+    rows = []
+    for way in (*found["peers"], *found["ways"]):
+        name = way["way"]
+        ratios = found["ratios"].get(name, {})
+        cells = [f"{ratios[bare]['ratio']:.2f}" if bare in ratios else "" for bare in BARE]
+        use = [f"{found['use'][name][side]['cpu_ms']:.2f}" for side in ("client", "server")]
+        rows.append([name, f"{way['median_ms']:.2f}", *cells, *use])
+    return head, rows
+
+
 def main(
-    calls: Calls = 1000, peers_python: others.PeersPython = others.PYTHON, out_file: Out = None
+    calls: Calls = 1000,
+    peers_python: others.PeersPython = others.PYTHON,
+    table_of_page: TableOfPage = False,
+    out_file: Out = None,
 ) -> None:
     """Compare HTTP with JPEG with a bare application, the WebSocket, and vlagents."""
     with errors():
@@ -213,6 +234,9 @@ def main(
         found = measure_floor(calls, peers_python)
         show_round_trips(found, "round trip of one act over HTTP on this machine")
         show_use(found)
+        if table_of_page:
+            head, rows = page_table(found)
+            replace_rows("HTTP and its lower bound", head, rows, origin["date"])
         save({**origin, **found, "versions": origin["versions"] | found["versions"]}, out_file)
 
 

@@ -21,7 +21,7 @@ from benchmarks.figures import (
     ratios,
 )
 from benchmarks.hop import CHILD, IN_PROCESS, measure_hop
-from benchmarks.http_floor import bare_application
+from benchmarks.http_floor import DIRECT, PROXIED, bare_application, page_table
 from benchmarks.own_clients import OWN_CLIENTS, connect, observation, own_clients
 from benchmarks.processes import DAEMONS
 from benchmarks.round_trips import ROUND, in_turns, measure
@@ -170,6 +170,24 @@ def test_both_ways_are_measured_in_turns_and_the_child_costs_time() -> None:
     assert (here.name, there.name) == (IN_PROCESS, CHILD)
     assert here.rounds.shape == there.rounds.shape == (2, 100)
     assert 0 < here.median < there.median
+
+
+def test_the_table_of_http_compares_each_way_with_both_bare_applications() -> None:
+    ways = {"http, jpeg": 2.4, DIRECT: 1.5, PROXIED: 2.0}
+    head, rows = page_table(
+        {
+            "ways": [{"way": "http, jpeg", "median_ms": 2.4}],
+            "peers": [{"way": name, "median_ms": ways[name]} for name in (DIRECT, PROXIED)],
+            "ratios": {"http, jpeg": {DIRECT: {"ratio": 1.6}, PROXIED: {"ratio": 1.2}}},
+            "use": {name: {"client": {"cpu_ms": 1}, "server": {"cpu_ms": 2}} for name in ways},
+        }
+    )
+    assert len(head) == 6
+    assert rows == [
+        [DIRECT, "1.50", "", "", "1.00", "2.00"],
+        [PROXIED, "2.00", "", "", "1.00", "2.00"],
+        ["http, jpeg", "2.40", "1.60", "1.20", "1.00", "2.00"],
+    ]
 
 
 def test_the_bare_application_answers_its_client() -> None:
