@@ -211,7 +211,14 @@ def page_table(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     Args:
         found: The result of `measure_floor`.
     """
-    head = ["", "median ms", "/ bare HTTP", "/ bare HTTP behind HAProxy", "client CPU ms", "server CPU ms"]
+    head = [
+        "",
+        "median ms",
+        "/ bare HTTP",
+        "/ bare HTTP behind HAProxy",
+        "client CPU ms",
+        "server CPU ms",
+    ]
     rows = []
     for way in (*found["peers"], *found["ways"]):
         name = way["way"]
