@@ -28,7 +28,7 @@ def served(app: ASGIApp) -> Iterator[int]:
     server = uvicorn.Server(
         uvicorn.Config(app, port=port, log_level="critical", lifespan="off", ws="websockets-sansio")
     )
-    thread = threading.Thread(target=lambda: asyncio.run(server.serve()))
+    thread = threading.Thread(target=lambda: asyncio.run(_serve(server)))
     thread.start()
     wait_for(lambda: server.started)
     try:
@@ -36,6 +36,20 @@ def served(app: ASGIApp) -> Iterator[int]:
     finally:
         server.should_exit = server.force_exit = True
         thread.join()
+
+
+async def _serve(server: uvicorn.Server) -> None:
+    """Run a server, and end the applications whose connections are still open.
+
+    `asyncio.run` would cancel each task once and wait for it. Before Python 3.12,
+    `asyncio.wait_for` drops a cancellation that coincides with the awaited event, such as the next
+    message of a page in a browser; the task would then run for ever.
+    """
+    await server.serve()
+    while tasks := asyncio.all_tasks() - {asyncio.current_task()}:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks, timeout=0.1)
 
 
 @contextlib.contextmanager
