@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import FrameType
+from typing import NoReturn
 
 _FIRST_WAKE_S = 0.05  # time for the main thread to run a handler by itself
 _LONGEST_WAKE_S = 5.0  # native code may return early from a system call at each of these signals
@@ -164,10 +165,20 @@ class _Waker:
 
 @dataclass(frozen=True, slots=True)
 class _Ending:
-    """A signal that ends the program, and the exception that its handler has raised."""
+    """A signal that ends the program.
+
+    It does not keep the exception of the handler, whose traceback would keep the objects of all
+    interrupted functions.
+    """
 
     number: int
-    error: BaseException
+    status: int | None  # exit status of the program; None raises `KeyboardInterrupt`
+
+    def raise_error(self) -> NoReturn:
+        """Raise the exception that ends the program."""
+        if self.status is None:
+            raise KeyboardInterrupt
+        raise SystemExit(self.status)
 
 
 class _Process:
@@ -220,9 +231,9 @@ def interrupts() -> Iterator[None]:
         yield
         return
 
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        _process.ending = _Ending(number, KeyboardInterrupt())
-        signal.default_int_handler(number, frame)
+    def on_signal(number: int, _: object) -> None:
+        _process.ending = _Ending(number, None)
+        _process.ending.raise_error()
 
     numbers = (signal.SIGINT, signal.SIGTERM)
     with delivered():
@@ -252,10 +263,9 @@ def ended_by_signals(*numbers: signal.Signals) -> Iterator[None]:
 
     def on_signal(number: int, _: object) -> None:
         signal.signal(number, signal.SIG_IGN)
-        is_interrupt = number == signal.SIGINT
-        error = KeyboardInterrupt() if is_interrupt else SystemExit(128 + number)
-        _process.ending = _Ending(number, error)
-        raise error
+        status = None if number == signal.SIGINT else 128 + number
+        _process.ending = _Ending(number, status)
+        _process.ending.raise_error()
 
     with contextlib.ExitStack() as undo:
         if replaced:
@@ -297,7 +307,7 @@ def raise_dropped() -> None:
     if the signal has arrived within `interrupts` or `ended_by_signals`, and the context continues.
     """
     if _process.ending is not None:
-        raise _process.ending.error
+        _process.ending.raise_error()
 
 
 @contextlib.contextmanager

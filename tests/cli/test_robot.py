@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from dropped_signals import SendsSignal
 from typer.testing import CliRunner
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
@@ -380,13 +381,6 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return serve
 
 
-class Interrupted:
-    """Python drops the exception of the signal's handler, which runs in this destructor."""
-
-    def __del__(self) -> None:
-        signal.raise_signal(signal.SIGTERM)
-
-
 class Interrupting(SimulatedRobot):
     """A robot whose driver is interrupted in a destructor."""
 
@@ -395,7 +389,7 @@ class Interrupting(SimulatedRobot):
     def observe(self) -> Obs:
         self.observed += 1
         if self.observed == 5:
-            Interrupted()
+            SendsSignal(signal.SIGTERM)
         return super().observe()
 
 

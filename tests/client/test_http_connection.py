@@ -62,7 +62,7 @@ def ends(
 
 def exchanged(client: ServerConnection, server: socket.socket) -> bytes:
     """Exchange a request and its answer; return the request."""
-    client.send("GET", "/", {}, None, 10)
+    client.send("GET", "/", {}, (), 10)
     received = server.recv(65536)
     server.sendall(ANSWER)
     assert client.receive("GET").read() == b"ok"
@@ -72,8 +72,8 @@ def exchanged(client: ServerConnection, server: socket.socket) -> bytes:
 @pytest.mark.parametrize(
     ("method", "body", "want"),
     [
-        ("GET", None, b"\r\n\r\n"),
-        ("POST", None, b"content-length: 0\r\n"),
+        ("GET", (), b"\r\n\r\n"),
+        ("POST", (), b"content-length: 0\r\n"),
         ("POST", [b"ab", memoryview(b"cd")], b"content-length: 4\r\n"),
         ("POST", [np.zeros((2, 3), np.float32)], b"content-length: 24\r\n"),
     ],
@@ -86,7 +86,7 @@ def test_a_request_is_sent_at_once(method: str, body: Any, want: bytes) -> None:
     assert (b"content-length" in head) == (method == "POST")
     assert head.startswith(f"{method} /act?a=1 HTTP/1.1\r\nhost: 127.0.0.1:".encode())
     assert head.endswith(b"\r\nx-name: 1")
-    assert content == b"".join(body or ())
+    assert content == b"".join(body)
 
 
 def test_an_idle_connection_is_open_until_the_server_closes_it(
@@ -125,7 +125,7 @@ def test_the_time_of_a_whole_exchange_is_limited(
                 server.sendall(bytes([byte]))
                 time.sleep(pause_s)
 
-    client.send("GET", "/", {}, None, LIMIT_S)
+    client.send("GET", "/", {}, (), LIMIT_S)
     with ThreadPoolExecutor(1) as thread:
         if pause_s:
             thread.submit(drips)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dropped_signals import SendsSignal
 
 from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs, PlayerSettings
 from vlagents_ray.robot import Guard, LoopOptions, MotionLimits, run_loop
@@ -107,29 +108,19 @@ def test_a_signal_ends_a_loop_of_a_users_own_program_and_stops_the_robot(
     assert (arm.commands, arm.stops) == (3, 1)
 
 
-class SendsSignal:
-    """Python drops the exception of the signal's handler, which runs in this destructor."""
-
-    def __init__(self, number: signal.Signals) -> None:
-        self.number = number
-
-    def __del__(self) -> None:
-        signal.raise_signal(self.number)
-
-
 class Interrupted(Arm):
-    """An arm whose driver is interrupted in a destructor at a call of `place`, in the run or on the
+    """An arm whose driver is interrupted in a destructor at a call of `method`, in the run or on the
     way to the rest pose.
     """
 
-    def __init__(self, number: signal.Signals, place: str, *, at_rest: bool) -> None:
+    def __init__(self, number: signal.Signals, method: str, *, at_rest: bool) -> None:
         super().__init__()
-        self.sends, self.place, self.at_rest = number, place, at_rest
+        self.sends, self.method, self.at_rest = number, method, at_rest
         self.calls = 0
         self.commands_at_signal: int | None = None
 
-    def _called(self, place: str) -> None:
-        if place != self.place:
+    def _called(self, method: str) -> None:
+        if method != self.method:
             return
         self.calls += 1
         # The run has 5 ticks, and the way to the rest pose many more.
@@ -148,7 +139,7 @@ class Interrupted(Arm):
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("at_rest", [False, True])
-@pytest.mark.parametrize("place", ["observe", "apply"])
+@pytest.mark.parametrize("method", ["observe", "apply"])
 @pytest.mark.parametrize(
     ("number", "context"),
     [
@@ -160,11 +151,11 @@ class Interrupted(Arm):
 def test_nothing_is_commanded_after_a_signal_whose_exception_python_drops(
     number: signal.Signals,
     context: Callable[[], contextlib.AbstractContextManager[None]],
-    place: str,
+    method: str,
     *,
     at_rest: bool,
 ) -> None:
-    arm = Interrupted(number, place, at_rest=at_rest)
+    arm = Interrupted(number, method, at_rest=at_rest)
     limits = MotionLimits(velocity=1.0, acceleration=5.0, rest=(0.5, 0.5))
     guard = Guard(Still.contract, limits=limits, hz=200)
     before = signal.signal(number, default_handler(number))

@@ -86,7 +86,7 @@ class ServerConnection:
         method: str,
         target: str,
         headers: Mapping[str, str],
-        body: Sequence[Buffer] | None,
+        body: Sequence[Buffer],
         timeout_s: float,
     ) -> None:
         """Begin an exchange: send a request.
@@ -95,7 +95,7 @@ class ServerConnection:
             method: The method, such as "POST".
             target: The path, and perhaps a query, in ASCII.
             headers: Further headers than the host and the length of the body.
-            body: Consecutive pieces of the body; None if the request has no body.
+            body: Consecutive pieces of the body; empty if the request has no body.
             timeout_s: The time limit of the whole exchange, s.
 
         Raises:
@@ -106,12 +106,11 @@ class ServerConnection:
         self._deadline = time.monotonic() + timeout_s
         # Without `identity`, a proxy might compress the answer.
         fields = {"host": self._host, "accept-encoding": "identity"}
-        pieces = body or ()
-        size = sum(memoryview(piece).nbytes for piece in pieces)
+        size = sum(memoryview(piece).nbytes for piece in body)
         if size or method != "GET":
             fields["content-length"] = str(size)
         head = request_head(method, target, {**fields, **headers})
-        self._send_all(b"".join([head, *pieces]))
+        self._send_all(b"".join([head, *body]))
 
     def receive(self, method: str) -> http.client.HTTPResponse:
         """Return the response to the last request, of which the head has been read.

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm_models import ARMS, model_file, simulated_arm
+from dropped_signals import SendsSignal
 from faulty_arms import FAULTS, ClockStep, Fault, FaultyArm, QuaternionOrder
 
 from vlagents_ray.errors import ConfigError
@@ -240,13 +241,6 @@ def test_without_a_terminal_nothing_is_agreed(monkeypatch: pytest.MonkeyPatch) -
     assert not Operator(move=True).agrees("a move")
 
 
-class SendsSignal:
-    """Python drops the exception of the signal's handler, which runs in this destructor."""
-
-    def __del__(self) -> None:
-        signal.raise_signal(signal.SIGTERM)
-
-
 class Interrupted(Counting):
     """An arm whose driver is interrupted in a destructor while it moves."""
 
@@ -255,7 +249,7 @@ class Interrupted(Counting):
     def observe(self) -> Obs:
         if self.commands > 20 and self.commands_at_signal is None:
             self.commands_at_signal = self.commands
-            SendsSignal()
+            SendsSignal(signal.SIGTERM)
         return super().observe()
 
 

@@ -189,7 +189,7 @@ class HttpTransport:
         method: str = "GET",
     ) -> dict[str, Any]:
         """Return the JSON document with which the server answers a request without a body."""
-        status, kind, body = self._link.exchange(method, path, None, headers or {}, timeout_s)
+        status, kind, body = self._link.exchange(method, path, (), headers or {}, timeout_s)
         if status != 200:
             raise refusal(status, kind, body)
         document = _json(body)
@@ -399,7 +399,7 @@ class _Link:
         self,
         method: str,
         path: str,
-        body: Sequence[Buffer] | None,
+        body: Sequence[Buffer],
         headers: dict[str, str],
         timeout_s: float,
         probe: Callable[[], bool] | None = None,
@@ -407,7 +407,7 @@ class _Link:
         """Send a request; return the status, content type and body of the answer.
 
         Args:
-            body: Consecutive pieces of the body; None if the request has no body.
+            body: Consecutive pieces of the body; empty if the request has no body.
             probe: Pings the replica, and returns whether it is alive. It is called on other
                 threads, as one connection carries one request at a time. If it is None, the replica
                 is not watched.
@@ -488,7 +488,7 @@ class _Link:
         """
         link = _Link(self.url, self._credentials)
         with contextlib.closing(link), contextlib.suppress(VLAgentsError):
-            link.exchange("GET", "/ping", None, {}, PROBE_S)
+            link.exchange("GET", "/ping", (), {}, PROBE_S)
             return True
         return False
 
@@ -534,7 +534,7 @@ class _ProxiedProbe:
         is_first, self.accepts_first = self.accepts_first, False
         link = _Link(self._url, self._credentials)
         with contextlib.closing(link), contextlib.suppress(VLAgentsError):
-            status, _, body = link.exchange("GET", "/v1/metadata", None, self._headers, PROBE_S)
+            status, _, body = link.exchange("GET", "/v1/metadata", (), self._headers, PROBE_S)
             metadata = _json(body)
             if status != 200 or not isinstance(metadata, dict):
                 return False

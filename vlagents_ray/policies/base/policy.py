@@ -308,18 +308,16 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         is_compiled = self.compilation.mode and self.compilation.cores
         if not (self.report.accelerated or is_compiled):
             return
-        sizes = self.config.batch_sizes or []
         pass_s = self.report.pass_s
         pass_s.clear()
         self.report.splits_by_time = False
-        for size in sizes:
+        for size in self.config.batch_sizes or ():
             self._run_rows(size, seeds)
 
         # A pass that seems slower than several smaller ones may have been delayed by another
         # process.
-        fits = [size for size in sizes if size in pass_s]
-        for size in fits:
-            if len(fastest_split(size, tuple((one, pass_s[one]) for one in fits))) > 1:
+        for size in tuple(pass_s):
+            if len(fastest_split(size, tuple(pass_s.items()))) > 1:
                 self._run_rows(size, seeds)
         self.report.splits_by_time = self.report.accelerated
 

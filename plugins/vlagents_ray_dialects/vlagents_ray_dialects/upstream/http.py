@@ -96,7 +96,7 @@ class HttpClient(UpstreamClient):
             raise self.closed()
 
         max_bytes = self.options.limits.body_bytes
-        pieces = None if content is None else [content]
+        pieces = () if content is None else (content,)
         try:
             self._connection.send(method, path, self._headers, pieces, self.options.timeout_s)
             response = self._connection.receive(method)
