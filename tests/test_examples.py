@@ -63,6 +63,7 @@ def test_a_script_does_what_it_says(
     assert re.search(last, said(name, reader, monkeypatch, capsys))
 
 
+@pytest.mark.slow
 def test_the_sweep_shows_where_the_policy_fails(
     reader: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,6 +77,7 @@ def test_the_sweep_shows_where_the_policy_fails(
     assert {(each[0], each[-1]) for each in rates.values()} == {("100", "0")}
 
 
+@pytest.mark.slow
 def test_the_later_checkpoint_is_shown_to_be_better(
     reader: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -70,6 +70,7 @@ def _reached(start: str, edges: dict[str, set[str]]) -> set[str]:
     return found
 
 
+@pytest.mark.slow
 def test_no_module_imports_itself_by_way_of_others() -> None:
     edges = {
         module: {name for name in imports(module) if name in FILES and name != module}

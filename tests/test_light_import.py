@@ -113,6 +113,7 @@ for module in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_no_module_of_a_robots_imports_anything_heavy() -> None:
     lines = [line.split() for line in python(EACH_IN_A_FORK, *light_modules()).splitlines()]
     assert [module for module, *_ in lines] == light_modules()

@@ -50,6 +50,7 @@ def is_open(client: socket.socket) -> bool:
         return False
 
 
+@pytest.mark.slow
 @PAGES
 @pytest.mark.parametrize("sent", [b"", HALF_A_HEADER], ids=["nothing", "half a header"])
 def test_a_connection_without_a_request_is_closed(

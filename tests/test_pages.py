@@ -109,6 +109,7 @@ def named(page: Path, block: Block) -> object:
     return pytest.param(page, block, id=f"{page.stem}-{block}", marks=marks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "block"), [named(page, block) for page, block in RUN_HERE])
 def test_a_block_works(page: Path, block: Block, reader: Path) -> None:
     run(block, reader, page=page.stem)

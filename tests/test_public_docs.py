@@ -202,6 +202,7 @@ def wrong_examples(source: str) -> list[str]:
     return wrong
 
 
+@pytest.mark.slow
 def test_examples_in_docstrings_are_valid_python() -> None:
     wrong = {}
     for folder in SOURCES:

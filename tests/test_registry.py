@@ -154,6 +154,7 @@ def extras_named_in_code() -> set[tuple[str, str]]:
     return named
 
 
+@pytest.mark.slow
 def test_each_extra_that_a_message_names_exists() -> None:
     extras = {}
     for file in (ROOT / "pyproject.toml", *ROOT.glob("plugins/*/pyproject.toml")):
@@ -194,6 +195,7 @@ def required() -> Iterator[str]:
                     yield module.partition(".")[0]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("nothing_installed")
 def test_every_optional_package_has_a_cure() -> None:
     assert [

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from mutants import ROOT, SUBJECTS, Subject, mutants_of
 from needs import left_out
-from schedule import in_order
+from schedule import in_order, not_marked_slow
 
 
 @pytest.mark.parametrize(
@@ -64,6 +64,17 @@ def test_what_runs_alone_is_apart_from_its_file_and_clusters_are_played_by_one_p
     for test, unit in in_order([*beside, *alone]).items():
         together.setdefault(unit, []).append(test)
     assert list(together.values()) == [beside[:2], beside[2:3], beside[3:], alone[:1], alone[1:]]
+
+
+def test_tests_that_should_be_marked_slow_are_listed_with_the_time_of_all_cases() -> None:
+    def report(test: str, *markers: str) -> pytest.TestReport:
+        keywords = dict.fromkeys(markers, 1)
+        place = ("test_a.py", 1, "a")
+        return pytest.TestReport(test, place, keywords, "passed", None, "call", duration=1.5)
+
+    cases = [report(f"test_a.py::a[{number}]") for number in range(4)]
+    marked = [report(f"test_a.py::b[{number}]", "slow") for number in range(9)]
+    assert not_marked_slow([*cases, *marked, report("test_a.py::c")]) == {"test_a.py::a": 6.0}
 
 
 SUPPORT = Path(__file__).parent / "support"
@@ -184,6 +195,7 @@ def run(folder: Path, ci: str) -> tuple[int, str]:
     return done.returncode, done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ci", "broken", "status"), [("true", False, 0), ("true", True, 1), ("", False, 1)]
 )

@@ -92,6 +92,7 @@ for number in NUMBERS:
 """)
 
 
+@pytest.mark.slow
 def test_a_signal_at_any_moment_ends_a_wait() -> None:
     """The moments sweep the instructions before a system call, after the last one at which Python
     runs handlers.
@@ -108,6 +109,7 @@ with delivered():
 """)
 
 
+@pytest.mark.slow
 def test_a_signal_at_any_moment_sets_the_flag_that_the_main_thread_waits_for() -> None:
     """The handler takes no lock that the main thread may hold."""
     run_program("""

@@ -16,6 +16,7 @@ from tables import page_of
 from vlagents_ray.registry import entries
 
 
+@pytest.mark.slow
 def test_the_page_has_the_tests_that_there_are_with_what_became_of_them() -> None:
     page = verified.PAGE.read_text()
     assert verified.with_table(page) == page, "run `python tests/support/verified.py`"

@@ -92,6 +92,7 @@ NO_MISTAKES = {("setting", "a tab"), ("setting", "not UTF-8")}  # valid as text 
 CASES = [case for case in itertools.product(READERS, WRONG) if case not in NO_MISTAKES]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("reader", "wrong"), CASES)
 def test_each_reader_answers_a_wrong_text_with_its_file(
     reader: str, wrong: str, tmp_path: Path
@@ -116,6 +117,7 @@ def test_a_file_of_runs_with_a_key_twice_is_an_error_of_the_command(tmp_path: Pa
     assert "keep one of the two" in done.stderr
 
 
+@pytest.mark.slow
 def test_no_other_module_reads_yaml() -> None:
     folder = Path(vlagents_ray.__file__).parent
     readers = set()

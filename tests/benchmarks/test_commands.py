@@ -80,6 +80,7 @@ def test_no_command_has_an_option_twice() -> None:
 
 
 # Where a mistake is not noticed, the benchmark starts, and would run for as long as a test may.
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize(
     ("module", "words", "text"),

@@ -12,6 +12,7 @@ from vlagents_ray.robot import MotionLimits
 MINUTES = 1 / 60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arms", [1, 2])
 @pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
 def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop(
@@ -33,12 +34,14 @@ def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop(
     assert len(report.faults) > 10
 
 
+@pytest.mark.slow
 def test_a_seed_replays_each_command() -> None:
     first, again, other = (day.play_day(seed, 3 * MINUTES) for seed in (1, 1, 2))
     assert first == again
     assert first.digest != other.digest
 
 
+@pytest.mark.slow
 def test_a_guard_without_limits_lets_jumps_through_which_the_day_finds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -47,6 +50,7 @@ def test_a_guard_without_limits_lets_jumps_through_which_the_day_finds(
     assert any("a step of" in one for one in report.violations)
 
 
+@pytest.mark.slow
 def test_a_restart_from_afar_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simulation itself checks this: a watchdog that restarts by itself commands the robot
     without an operator.

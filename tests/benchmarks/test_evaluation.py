@@ -95,6 +95,7 @@ def test_ours_says_how_busy_both_sides_were(tmp_path: Path) -> None:
     assert (played.env_busy, played.policy_busy) == (0.75, 0.5)
 
 
+@pytest.mark.slow
 def test_ours_without_workers_plays_the_plan_soon_after_its_start(tmp_path: Path) -> None:
     alone_here = replace(FEW, workers=0)
     played = play(alone_here, our_run(alone_here), tmp_path / "here")

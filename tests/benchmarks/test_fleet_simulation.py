@@ -30,6 +30,7 @@ def result_of(name: str, shape: Shape = SMALL) -> Outcome:
     return outcome(scenario, tally, world, cpu_s=0.0)
 
 
+@pytest.mark.slow
 def test_all_robots_that_start_at_once_are_in_time() -> None:
     for name in ("morning", "rush"):
         result = result_of(name)
@@ -38,10 +39,12 @@ def test_all_robots_that_start_at_once_are_in_time() -> None:
         assert result.most_sessions <= 13, "a quarter more than the mean must be tolerated"
 
 
+@pytest.mark.slow
 def test_a_hash_places_sessions_less_evenly() -> None:
     assert result_of("hash").most_sessions >= result_of("morning").most_sessions
 
 
+@pytest.mark.slow
 def test_robots_are_in_time_again_after_losses() -> None:
     for name in ("node", "rack"):
         result = result_of(name)
@@ -50,12 +53,14 @@ def test_robots_are_in_time_again_after_losses() -> None:
         assert 0 < result.all_in_time_s < 15
 
 
+@pytest.mark.slow
 def test_robots_move_to_new_replicas_without_a_late_tick() -> None:
     result = result_of("growth")
     assert result.moves > 0
     assert result.share == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_rolling_update_replaces_all_replicas() -> None:
     scenario = SCENARIOS["update"]
     tally, world = run(scenario, SMALL, seed=1)
@@ -65,6 +70,7 @@ def test_a_rolling_update_replaces_all_replicas() -> None:
     assert outcome(scenario, tally, world, 0.0).share > 0.99
 
 
+@pytest.mark.slow
 def test_a_fleet_that_is_too_large_has_robots_that_are_late() -> None:
     result = result_of("morning", replace(SMALL, robots=600))
     assert result.late_robots > 50

@@ -163,6 +163,7 @@ def test_the_limits_of_each_run_fit_into_its_time_and_both_into_a_quarter_of_an_
     assert {*named} == {*STEPS}
 
 
+@pytest.mark.slow
 def test_the_plan_is_printed_and_one_that_does_not_fit_is_rejected() -> None:
     command = [sys.executable, "-m", "benchmarks.gpu", "--run", "serving"]
     plan = subprocess.run([*command, "--plan"], capture_output=True, text=True, check=True).stdout

@@ -38,6 +38,7 @@ def test_missing_tools_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         enter()
 
 
+@pytest.mark.slow
 def test_both_namespaces_end_with_a_bench_that_was_killed() -> None:
     """A process keeps the client's namespace alive, and the bench itself the server's."""
     try:

@@ -56,6 +56,7 @@ BURN = (
 )
 
 
+@pytest.mark.slow
 def test_what_a_process_used_is_counted_and_stays_counted_when_it_has_ended() -> None:
     with subprocess.Popen(
         [sys.executable, "-c", BURN], stdin=subprocess.PIPE, stdout=subprocess.PIPE

@@ -184,6 +184,7 @@ with peer_connected(one, Path(sys.executable), Path(sys.argv[2]), {}) as driver:
 """
 
 
+@pytest.mark.slow
 def test_a_killed_bench_takes_the_processes_of_a_server_along_that_it_has_stopped(
     tmp_path: Path, obs: Path
 ) -> None:
@@ -237,6 +238,7 @@ def test_clients_of_one_script_share_a_server_if_it_says_so(fake: PeerClient, ob
             assert (first.address == second.address) is shares
 
 
+@pytest.mark.slow
 def test_a_fleet_makes_load_with_the_policy_of_the_plan(fake: PeerClient, obs: Path) -> None:
     for one in (fake, replace(fake, one_process=True)):
         with peer_fleet(one, FEW, obs, {}) as fleet:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from benchmarks.placement import PlacementPlan, place
 
 
+@pytest.mark.slow
 def test_replicas_of_robots_that_differ_are_evener_if_sessions_are_placed_by_needs() -> None:
     plan = PlacementPlan(replicas=4, robots=30, begin_within_s=20.0, seconds=40.0)
     by_number = place(plan, 0, weighs_robots=False)

@@ -53,6 +53,7 @@ def plan(**changed: Any) -> PolicyPlan:
     return PolicyPlan(**{"args": args, "batches": (1, 4), "seconds": 0.1, "rounds": 2, **changed})
 
 
+@pytest.mark.slow
 def test_larger_batches_give_more_actions_bare_and_behind_the_queue() -> None:
     found = measure_policy(plan(rounds=5))
     one, four = found["batches"]
@@ -72,6 +73,7 @@ def test_larger_batches_give_more_actions_bare_and_behind_the_queue() -> None:
     assert one["peak_mib"] > 0
 
 
+@pytest.mark.slow
 def test_observations_fit_the_contract_and_what_it_leaves_open_can_be_said() -> None:
     args = ServerArgs(policy=f"{__name__}:Picky")
     found = measure_policy(plan(args=args, side=48, dims={"pose": 9}))

@@ -123,6 +123,7 @@ def test_a_ratio_lies_in_its_interval_and_the_truth_does_too() -> None:
     assert found.high - found.low < 0.05
 
 
+@pytest.mark.slow
 def test_the_interval_covers_the_truth_about_as_often_as_it_says() -> None:
     hits = 0
     for seed in range(40):
@@ -165,6 +166,7 @@ def test_what_figures_depend_on_is_json_without_names_of_hosts() -> None:
     assert said["machine"].keys() == {"cpu", "cores", "memory_gb", "kernel", "load"}
 
 
+@pytest.mark.slow
 def test_both_ways_are_measured_in_turns_and_the_child_costs_time() -> None:
     here, there = measure_hop(200).ours
     assert (here.name, there.name) == (IN_PROCESS, CHILD)
@@ -190,6 +192,7 @@ def test_the_table_of_http_compares_each_way_with_both_bare_applications() -> No
     ]
 
 
+@pytest.mark.slow
 def test_the_bare_application_answers_its_client() -> None:
     with bare_application(Path(), is_proxied=False) as client:
         assert client.ready() == {}

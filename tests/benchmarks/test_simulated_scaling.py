@@ -43,6 +43,7 @@ def test_a_slow_rise_misses_no_tick() -> None:
     assert seconds_late(trace) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robots", range(1, 40))
 def test_any_steady_number_of_robots_has_a_steady_number_of_replicas(robots: int) -> None:
     scaling = AutoscalingArgs(downscale_delay_s=10.0, max_replicas=100)
@@ -68,6 +69,7 @@ def test_late_robots_get_one_more_replica_which_stays() -> None:
     assert again <= 1205, "the need for two replicas must be remembered while the robots are away"
 
 
+@pytest.mark.slow
 def test_robots_that_more_replicas_do_not_help_get_one_more_at_most() -> None:
     late_always = replace(FLEET, hidden_late=lambda _, robots: robots)
     assert changes(simulate(lambda _: 6, 3000, late_always)) == [1, 2]
@@ -86,6 +88,7 @@ def test_the_load_of_robots_does_not_depend_on_where_they_are() -> None:
     assert slo_load(FLEET.costs, {}, 16) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [1, 8, 50])
 @pytest.mark.parametrize("hz", [1.0, 5.0, 10.0, 30.0])
 @pytest.mark.parametrize("age_s", [None, 0.1, 0.2, 0.5, 2.0])

@@ -180,6 +180,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize(("text", "message"), WRONG.values(), ids=WRONG)
 @pytest.mark.parametrize("row", ROWS.values(), ids=ROWS)

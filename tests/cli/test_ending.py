@@ -45,6 +45,7 @@ typer.run(command)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "leave_s"),
     [
@@ -80,6 +81,7 @@ def test_a_command_that_leaves_ray_by_itself_is_left_alone() -> None:
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noticed", [True, False])
 def test_one_that_was_interrupted_says_so_though_the_signal_ended_ray_as_well(
     noticed: bool,
@@ -90,6 +92,7 @@ def test_one_that_was_interrupted_says_so_though_the_signal_ended_ray_as_well(
     assert (ended.returncode, ended.stderr.strip()) == (130, "Error: interrupted")
 
 
+@pytest.mark.slow
 def test_a_server_that_hangs_while_it_leaves_ends_and_says_where() -> None:
     """In an earlier version, the shutdown after Ctrl-C could hang forever without any message."""
     interrupt = "import os, threading; threading.Timer(0.5, os.kill, (os.getpid(), 2)).start()"
@@ -100,6 +103,7 @@ def test_a_server_that_hangs_while_it_leaves_ends_and_says_where() -> None:
     assert "most recent call first" in ended.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [2, 15], ids=["Ctrl-C", "SIGTERM"])
 def test_an_interrupt_that_python_drops_ends_the_command_all_the_same(number: int) -> None:
     """An earlier server continued to serve if the signal arrived in one of Ray's callbacks during

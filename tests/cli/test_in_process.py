@@ -72,6 +72,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
     folder: Path,
 ) -> None:
@@ -190,6 +191,7 @@ def test_a_dry_run_names_the_workers_with_which_the_run_itself_is_played(
     assert not (folder / "runs").exists()
 
 
+@pytest.mark.slow
 def test_a_debugger_stops_in_the_policy_with_the_terminal_and_leaving_it_ends_the_command(
     folder: Path,
 ) -> None:

@@ -163,6 +163,7 @@ def evaluate_interrupted(
     assert (summary["state"], summary["totals"][0]["episodes"]) == ("interrupted", finished)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("policy", "workers", "finished", "number"), [*CASES, WITH_RAY])
 def test_one_signal_ends_an_evaluation_that_hangs(
     policy: str, workers: str, finished: int, number: signal.Signals, tmp_path: Path
@@ -188,6 +189,7 @@ def test_one_signal_ends_an_evaluation_whose_policy_hangs_while_its_server_start
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("policy", "finished", "number"),
     [("Initialize", 0, signal.SIGTERM), ("Close", EPISODES, signal.SIGINT)],
@@ -234,6 +236,7 @@ CHECKS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arm", "number", "on_another_thread"), CHECKS)
 def test_one_signal_ends_a_check_of_a_robot_that_hangs(
     arm: str, number: signal.Signals, on_another_thread: bool, tmp_path: Path

@@ -455,6 +455,7 @@ def answer(words: list[str]) -> tuple[int, str]:
     return done.exit_code, " ".join(done.output.split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", COMMANDS)
 def test_a_mistake_on_the_command_line_is_answered_with_its_cure(
     mistake: str, folder: Path
@@ -541,6 +542,7 @@ def test_the_light_install_names_all_commands_that_it_lacks() -> None:
     assert commands["robot"].help.strip() == ROBOT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
@@ -569,6 +571,7 @@ def test_all_errors_of_commands_have_one_form(words: list[str]) -> None:
     assert line.startswith("Error: "), line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", EPISODES)
 def test_a_mistake_in_a_policy_is_answered_with_its_place(policy: str) -> None:
     status, message = answer([*EVAL, f"own:{policy}"])

@@ -142,6 +142,7 @@ def is_wrong(command: str, option: str, path: str) -> bool:
     return not (path == "folder/absent/below" and option == "--out" and command in MADE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "option", "path"),
     [(*words, path) for words in COMMANDS for path in PATHS if is_wrong(*words, path)],

@@ -20,6 +20,7 @@ def report(*words: str) -> Result:
     return CliRunner().invoke(app, ["report", *words], env={"COLUMNS": "200"})
 
 
+@pytest.mark.slow
 def test_a_page_stands_beside_its_results_and_one_of_several_folders_where_it_is_wanted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -41,6 +42,7 @@ def test_a_page_stands_beside_its_results_and_one_of_several_folders_where_it_is
     assert (tmp_path / "report.html").is_file()
 
 
+@pytest.mark.slow
 def test_results_that_another_process_writes_are_watched_until_ctrl_c(tmp_path: Path) -> None:
     record(runs(tmp_path / "out", episodes=2))
     page = LivePage()

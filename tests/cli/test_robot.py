@@ -97,6 +97,7 @@ def until(lines: Iterator[str], text: str) -> None:
     raise AssertionError(f"{text!r} is not in the output: {printed}")
 
 
+@pytest.mark.slow
 def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> None:
     words = ["robot", *QUICK, "--teleop", "keyboard", "--record", str(tmp_path)]
     with at_a_terminal(MAIN, *words) as (process, press, lines):
@@ -117,6 +118,7 @@ def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> 
     assert max(action[0] for action in first["action"]) == 0.5
 
 
+@pytest.mark.slow
 def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
     words = [
         "robot",
@@ -162,6 +164,7 @@ def test_a_policy_alone_is_loaded_once_and_recorded_without_columns_that_nobody_
     assert len(loads) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.library("rerun")
 def test_episodes_are_shown_in_a_viewer(tmp_path: Path) -> None:
     run = robot("scripted", *QUICK, "--episodes", "2", "--hz", "200", "--rerun", str(tmp_path))
@@ -169,6 +172,7 @@ def test_episodes_are_shown_in_a_viewer(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("*.rrd"))) == 2
 
 
+@pytest.mark.slow
 def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:
     words = [
         "robot",
@@ -327,6 +331,7 @@ sys.exit(command.main(sys.argv[1:]))
         assert process.wait(30) == 128 + signal.SIGTERM
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wish", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_the_command_stops_the_robot_when_it_is_told_to_end(wish: signal.Signals) -> None:
     code = """
@@ -411,6 +416,7 @@ SHORT = ["http://nowhere", "--seconds", "1"]
 ATTEMPTS = 5  # other work of the machine may disturb such a short run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["async", "open_loop", "ensemble"])
 @pytest.mark.usefixtures("served")
 def test_a_policy_of_single_actions_drives_in_each_mode(
@@ -614,6 +620,7 @@ sys.exit(command.main(["http://gpu-box:8000", "--robot", "arm:Arm", "--seconds",
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wish", "status"),
     [(signal.SIGINT, 130), (signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGHUP, 129)],
@@ -635,6 +642,7 @@ def test_a_signal_ends_a_run_on_an_arm_with_its_table_and_its_recording(
     assert frames(tmp_path / "demos", 0)["action"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "label", "status"),
     [("y", "success", 0), ("n", "failure", 0), ("q", "none", 0), ("x", None, 0)],
@@ -693,6 +701,7 @@ class Arm:""",
 ).replace("command.RemoteAgent = Still", "command.RemoteAgent = Slow")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restart", ["auto", "manual", "signal"])
 def test_after_a_stop_the_command_says_once_that_the_server_answers_and_the_robot_continues(
     restart: str,
@@ -749,6 +758,7 @@ HERE = f"{__name__}"
 ARM = ["--robot", SIMULATED]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "said"),
     [

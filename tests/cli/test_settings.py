@@ -100,6 +100,7 @@ def said_by(*words: str) -> str:
 EVAL = ("--out", "runs/x", "--policy")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "wanted"),
     [
@@ -253,6 +254,7 @@ def test_a_module_that_is_nowhere_is_looked_for_in_the_working_directory_which_i
     ) in said
 
 
+@pytest.mark.slow
 def test_modules_are_found_in_the_folder_where_a_command_is_typed_unless_python_is_kept_from_it(
     folder: Path,
 ) -> None:

@@ -82,6 +82,7 @@ def failing_server(how: str) -> Iterator[str]:
         process.stdin.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transport", TRANSPORTS)
 @pytest.mark.parametrize(
     ("how", "kind", "parts"),

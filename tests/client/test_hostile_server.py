@@ -222,6 +222,7 @@ def test_the_honest_server_of_these_tests_is_understood() -> None:
         assert act_once(url).action.shape == (7,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entry", sorted(METADATA))
 def test_metadata_with_a_value_of_any_type_is_read_or_an_error_of_the_package(entry: str) -> None:
     document = METADATA | ADDRESSES
@@ -233,6 +234,7 @@ def test_metadata_with_a_value_of_any_type_is_read_or_an_error_of_the_package(en
                     act_once(url, transport)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [VLAgentsError, *sorted(BY_CODE.values(), key=repr)])
 def test_text_of_a_server_neither_commands_a_terminal_nor_forges_a_line(
     error: type[VLAgentsError],
@@ -300,6 +302,7 @@ def act_upstream(url: str) -> None:
 STATES = ["status line", "headers", "body", "chunks", "informational"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("client", ["remote agent", "upstream"])
 def test_a_server_that_answers_byte_by_byte_keeps_no_client_beyond_its_time(
@@ -315,6 +318,7 @@ def test_a_server_that_answers_byte_by_byte_keeps_no_client_beyond_its_time(
         assert time.monotonic() - begun < 20 * TIME_LIMIT_S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transport", ["websocket", "auto"])
 def test_a_websocket_whose_handshake_arrives_byte_by_byte_keeps_no_client_beyond_its_time(
     transport: str,

@@ -95,6 +95,7 @@ def test_an_error_has_its_code_and_text_and_the_session_goes_on(url: str) -> Non
         assert policy.act({}, joints(0))["action"].shape == (2, 2)
 
 
+@pytest.mark.slow
 def test_a_deadline_ends_the_wait_and_a_late_answer_is_not_taken_for_another(url: str) -> None:
     with Policy(url, timeout_s=SLOW_S / 2) as policy:
         policy.reset({}, joints(0))

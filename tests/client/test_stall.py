@@ -164,6 +164,7 @@ def check_recovery(run: Run, stall: int) -> None:
     assert still[resumed:].mean() < 0.1  # and the robot continues to move
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("killed", [False, True])
 @pytest.mark.parametrize("guarded", [False, True])
 @pytest.mark.parametrize("delta", [False, True])

@@ -31,6 +31,7 @@ def ports(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, int]]:
         yield {"PLAIN": plain, "TLS": encrypted, "MUTUAL": keyed, "CLOSED": free_port()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transport", ["auto", "http", "websocket"])
 @pytest.mark.parametrize(
     ("url", "kind", "said"),

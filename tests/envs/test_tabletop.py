@@ -53,6 +53,7 @@ def test_every_task_keeps_the_contract(task: str) -> None:
     check_env(make_env(f"tabletop/{task}"), steps=20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", Tabletop.tasks())
 def test_following_the_instruction_succeeds_and_another_one_does_not(task: str) -> None:
     env = Tabletop(task)

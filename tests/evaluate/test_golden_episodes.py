@@ -58,6 +58,7 @@ def episodes(name: str, out: Path) -> list[dict[str, Any]]:
     return [outcome | {"key": str(outcome["key"])} for outcome in outcomes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLANS)
 def test_its_episodes_are_those_of_earlier_versions(name: str, tmp_path: Path) -> None:
     assert episodes(name, tmp_path) == json.loads(GOLDEN.read_text())[name]

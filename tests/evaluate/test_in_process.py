@@ -243,6 +243,7 @@ class Slow(ToZero):
         return super().act(obs)
 
 
+@pytest.mark.slow
 def test_a_call_that_exceeds_its_limit_is_reported_with_its_line(
     config: Config, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

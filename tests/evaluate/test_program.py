@@ -159,6 +159,7 @@ def test_unchanged_files_are_gone_on_with(
     assert set(found.cases[0].program) >= {"prog_env.py", "prog_parts/sea.py", "prog_parts/wind.py"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("continuation", "name"),
     [
@@ -307,6 +308,7 @@ OF_THE_ENV: dict[str, tuple[Callable[[], Any], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("identity", OF_THE_ENV)
 def test_every_command_refuses_another_environment_unless_the_change_is_accepted(
@@ -428,6 +430,7 @@ def test_a_report_of_two_folders_keeps_a_policy_apart_that_is_not_the_same_in_bo
     assert results.policy_ids == ["own (a)", "own (b)"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["a class", "a partial", "a mapping", "a mapping of partials"])
 def test_the_code_of_an_own_policy_is_part_of_the_program_however_it_is_given(
     work: Path, tmp_path: Path, form: str

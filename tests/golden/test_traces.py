@@ -32,6 +32,7 @@ CASES = [
 IDS = [f"{file}-{trace.name}-{endpoint}" for file, trace, endpoint in CASES]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("file", "trace", "endpoint"), CASES, ids=IDS)
 def test_the_server_answers_as_recorded(
     file: str, trace: Trace, endpoint: str, tmp_path: Path

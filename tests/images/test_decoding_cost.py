@@ -82,6 +82,7 @@ def speed(honest: dict[str, tuple[bytes, float]]) -> float:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_a_hostile_file_takes_no_longer_than_honest_ones(
     name: str, honest: dict[str, tuple[bytes, float]]
@@ -91,6 +92,7 @@ def test_a_hostile_file_takes_no_longer_than_honest_ones(
     assert cpu_s(FILES[name](SIZE)) < FACTOR * sum(of_kind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_decoding_takes_no_longer_than_its_estimate(name: str, speed: float) -> None:
     """With this estimate, a server decides where it decodes a file, and whether it decodes it at
@@ -113,6 +115,7 @@ def peak_bytes() -> int:
     return int(line.split()[1]) * 1024
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [*FILES, "honest JPEG", "honest PNG", "honest PNG of others", "honest progressive JPEG"]
 )
@@ -137,6 +140,7 @@ def test_decoding_takes_no_more_memory_than_it_reserves(
     assert peak_bytes() - before < reserved + 3 * len(file) + SLACK
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_what_is_decoded_has_the_size_of_its_header(name: str) -> None:
     file = FILES[name](20_000)
@@ -234,6 +238,7 @@ def test_jpegs_of_other_encoders_are_decoded(options: dict[str, object], grey: b
     assert jpeg_png.decode(file).shape == (224, 224, 3)
 
 
+@pytest.mark.slow
 def test_the_files_are_what_their_names_say() -> None:
     """Otherwise the tests could pass because each file is rejected for another reason."""
     decoded = set()

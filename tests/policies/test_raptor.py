@@ -124,6 +124,7 @@ def test_a_session_that_must_not_be_resumed_gets_an_error(replicas: Replicas) ->
             agent.act(observation(reference()[0][1, 0]))
 
 
+@pytest.mark.slow
 def test_nine_of_ten_quadrotors_come_to_the_target_and_hover(policy: Raptor) -> None:
     """92 % of 500 different quadrotors, with a 95 % interval from 89 to 94 %."""
     batch, acts = HoverBatch(500), together(policy, 500)
@@ -140,6 +141,7 @@ def test_nine_of_ten_quadrotors_come_to_the_target_and_hover(policy: Raptor) -> 
     assert RATES["RAPTOR"]["episodes"] == 500
 
 
+@pytest.mark.slow
 def test_a_quadrotor_flies_alone_as_it_does_among_others(policy: Raptor) -> None:
     among = fly(range(8), together(policy, 8), 500)
     for seed in range(8):
@@ -184,6 +186,7 @@ def test_a_quadrotor_obeys_gravity_and_thrust() -> None:
     np.testing.assert_allclose(flights.state[:3], 0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_evaluation_plays_the_flights(policy: Raptor, tmp_path: Path) -> None:
     plan = EvalConfig(
         policies=[{"name": "raptor"}],

@@ -92,6 +92,7 @@ FRAMES = st.tuples(
 NO_MASK = bytes(4)  # the mask of this package's client, which changes nothing
 
 
+@pytest.mark.slow
 @settings(max_examples=many(400))
 @given(
     st.booleans(),

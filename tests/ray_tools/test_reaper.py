@@ -42,6 +42,7 @@ with reaped(Path(folder), lost=ConnectionError):
 """
 
 
+@pytest.mark.slow
 def test_the_reaper_needs_no_package_that_only_its_driver_finds(tmp_path: Path) -> None:
     # -S hides site-packages, even where the package is installed, as in an environment that finds
     # it through PYTHONPATH
@@ -50,6 +51,7 @@ def test_the_reaper_needs_no_package_that_only_its_driver_finds(tmp_path: Path) 
     assert (ran.returncode, ran.stderr) == (0, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["killed", "without Ray", "orderly"])
 def test_a_driver_that_was_killed_or_has_lost_ray_takes_its_cluster_along(
     tmp_path: Path, end: str

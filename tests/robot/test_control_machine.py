@@ -365,6 +365,7 @@ class Machine(RuleBasedStateMachine):
         assert self.wrong == []
 
 
+@pytest.mark.slow
 def test_nothing_moves_after_a_stop_or_in_a_pause_or_past_the_guard_in_any_order() -> None:
     run_state_machine_as_test(
         Machine, settings=settings(max_examples=many(200), stateful_step_count=50, deadline=None)

@@ -130,6 +130,7 @@ class Grasping(Agent):
         return Act(rows.astype(np.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delta", "arms"), KINDS)
 @pytest.mark.parametrize("mode", ["open_loop", "async"])
 @pytest.mark.parametrize("seed", range(3))
@@ -222,6 +223,7 @@ def test_the_way_to_rest_keeps_the_grippers(arms: int) -> None:
     assert np.allclose(np.delete(way[-1], columns), (0.1, 0.2, 0.3) * arms)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delta", "arms"), KINDS)
 def test_a_simulated_robot_has_its_grippers_where_they_were_commanded(
     delta: bool, arms: int

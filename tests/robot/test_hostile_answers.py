@@ -55,6 +55,7 @@ class Told(Agent):
         return Act(np.zeros(2, np.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", VALUES, ids=range(len(VALUES)))
 @pytest.mark.parametrize("field", ["info", "slo", "load", "in_time", "reason"])
 def test_an_answer_to_an_slo_of_any_type_ends_no_run_and_forges_no_line(

@@ -132,6 +132,7 @@ def test_pauses_are_counted_apart_from_ticks_that_the_policy_missed(clock: Simul
     assert len(arm.commanded) == 5, "a paused robot must get no command"
 
 
+@pytest.mark.slow
 def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:
     """A silent policy yields only safe actions. A human's actions count as signs of life."""
     gate = threading.Event()

@@ -106,6 +106,7 @@ def executed(
         return player._plan.executed / ticks, refused
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delta", [False, True], ids=["absolute", "relative"])
 @pytest.mark.parametrize(
     ("share", "soft_start_s"),
@@ -131,6 +132,7 @@ def test_answers_during_the_ease_in_do_not_keep_the_robot_from_moving(delta: boo
         assert rows > 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delta", [False, True], ids=["absolute", "relative"])
 @pytest.mark.parametrize(
     ("mode", "chunk", "at_least"),

@@ -144,6 +144,7 @@ def test_the_schedule_does_not_drift_and_says_what_it_missed() -> None:
     assert told["max_ms"] == pytest.approx(3.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frozen", [False, True])
 def test_the_process_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch, *, frozen: bool) -> None:
     monkeypatch.setattr(gc, "get_freeze_count", count_frozen)
@@ -338,6 +339,7 @@ class Silenced(Going):
         self.interrupts += 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "restart"),
     [(Hardware, None), (Hardware, "manual"), (Hardware, "auto"), (Watched, None)],

@@ -75,6 +75,7 @@ def require_within(path: np.ndarray, limits: MotionLimits, hz: float = HZ) -> No
         assert (brakes | (jerk <= np.asarray(limits.jerk) * 1.001 + 1.0)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delta", "arms"), KINDS)
 @pytest.mark.parametrize("seed", range(4))
 def test_no_accepted_sequence_exceeds_the_limits_from_the_first_action_on(
@@ -151,6 +152,7 @@ def test_no_command_of_a_player_exceeds_the_limits_from_the_first_one_and_after_
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delta", [False, True])
 @pytest.mark.parametrize("limit", [0.05, 0.1, 0.3, 5.0])
 @pytest.mark.parametrize("position", [0.0, 0.7, 3.1, 90.0, 179.0])
@@ -383,6 +385,7 @@ def require_accepted(guard: Guard, actions: np.ndarray) -> None:
         last = guard(action, last)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delta", "arms"), KINDS)
 @pytest.mark.parametrize("seed", range(3))
 def test_limits_of_a_dataset_accept_its_demonstrations_and_no_ten_times_faster_ones(

@@ -287,6 +287,7 @@ for episode in range(3):
     assert not (tmp_path / "unfinished").exists()
 
 
+@pytest.mark.slow
 def test_a_kill_at_any_moment_of_a_save_leaves_nothing_of_its_episode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

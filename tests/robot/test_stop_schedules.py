@@ -191,6 +191,7 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control_module, "COMMAND_S", LIMIT_S, raising=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restart", ["manual", "auto"])
 @pytest.mark.parametrize("source", ["trip", "silence"])
 def test_no_command_follows_a_stop_at_any_line_of_the_loop(

@@ -186,6 +186,7 @@ SOURCES = [*IN_OBSERVE, *IN_APPLY, *IN_POLICY]
 STOPS = [(source, setting) for source in SOURCES for setting in SETTINGS if occurs(source, setting)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("source", "setting"), STOPS, ids=str)
 def test_nothing_is_applied_after_a_stop(
     tmp_path: Path, source: str, setting: tuple[str, bool, Mode, bool, bool]
@@ -283,6 +284,7 @@ def blind_trial(tmp_path: Path, arm: Arm, person: Operator, policy: Policy, mode
     assert episode.result.steps <= MAX_STEPS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["open_loop", "async"])
 @pytest.mark.parametrize(
     ("moment", "relative"), [("driven", False), ("driven", True), ("on the way to rest", False)]

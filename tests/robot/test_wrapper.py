@@ -137,6 +137,7 @@ def wraps_a_robot(node: ast.ClassDef) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_every_class_around_a_robot_derives_from_the_one_wrapper() -> None:
     robot_classes = list(classes_that_name_robots())
     bases = {node.name: [ast.unparse(base) for base in node.bases] for _, node in robot_classes}

@@ -53,6 +53,7 @@ def replica(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KeyedReplica]:
         yield one
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "cell", CELLS, ids=lambda cell: f"{cell.endpoint}, {cell.when}, {cell.credential}"
 )

@@ -280,6 +280,7 @@ def test_half_a_message_is_not_waited_for() -> None:
 NO_HANDSHAKE = [RESET, b"GET / HTTP/1.1\r\n" + RESET, b"\r\n\r\n" + RESET, b"\0" * 40_000]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "first", [b"", b"GET / HTTP/1.1\r\nHost: x\r\n", *NO_HANDSHAKE], ids=range(6)
 )
@@ -298,6 +299,7 @@ def test_what_comes_without_a_handshake_is_cut_off_and_not_read(
         each.close()
 
 
+@pytest.mark.slow
 def test_a_silent_connection_ends_and_none_that_is_used_or_that_the_policy_keeps_waiting() -> None:
     """While the policy is busy, the missing reads are the server's, so the connection does not
     count as silent.
@@ -332,6 +334,7 @@ def test_a_silent_connection_ends_and_none_that_is_used_or_that_the_policy_keeps
             assert decode_replies(client.recv(5))[0].error is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said"),
     [({"revoked": True}, "revoked"), ({"expires": 1.0}, "expired"), ({"apps": ["x"]}, "not for")],
@@ -367,6 +370,7 @@ def test_a_revoked_key_is_cut_off_while_the_policy_takes_long(keyed: Replica) ->
         listen_to_the_end(leaver)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["own", "shm"])
 def test_a_key_has_no_more_connections_than_sessions(keyed: Replica, way: str) -> None:
     token, other = keyed.known.add("arm", sessions=2), keyed.known.add("lab")
@@ -400,6 +404,7 @@ def test_a_key_has_no_more_connections_than_sessions(keyed: Replica, way: str) -
     wait_for(lambda: not keyed.known.keys._connections)
 
 
+@pytest.mark.slow
 def test_a_local_client_shows_its_key_soon(keyed: Replica, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local, "_KEY_S", 0.3)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as silent:
@@ -612,6 +617,7 @@ def reset_over_shm(keyed: Replica) -> None:
     client.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("owner", "name", "over_http"),
     [

@@ -54,6 +54,7 @@ def acts_of_others(server: StoppableServer) -> None:
         server.ask(OTHERS[1], op)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REPLICA_CLIENTS)
 def test_an_act_that_was_abandoned_while_the_replica_was_frozen_is_not_executed(
     server: StoppableServer, name: str
@@ -73,6 +74,7 @@ def test_an_act_that_was_abandoned_while_the_replica_was_frozen_is_not_executed(
     assert BRIGHTNESS not in server.policy.acted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REPLICA_CLIENTS)
 def test_an_act_whose_client_waits_is_executed_when_the_replica_continues(
     server: StoppableServer, name: str
@@ -86,6 +88,7 @@ def test_an_act_whose_client_waits_is_executed_when_the_replica_continues(
     assert server.policy.acted.count(BRIGHTNESS) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REPLICA_CLIENTS)
 def test_an_act_that_was_abandoned_in_the_queue_is_not_executed(
     server: StoppableServer, name: str

@@ -356,6 +356,7 @@ def held() -> tuple[int, int, int]:
     return process.memory_info().rss, process.num_threads(), process.num_fds()
 
 
+@pytest.mark.slow
 def test_nothing_that_comes_before_a_key_crashes_bloats_or_acts(
     replica: KeyedReplica, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

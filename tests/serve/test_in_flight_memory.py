@@ -237,6 +237,7 @@ FLOODS: dict[str, Flood] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FLOODS)
 def test_requests_that_wait_take_no_more_memory_than_they_count(
     replica: Replica, name: str

@@ -704,6 +704,7 @@ def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPat
 # Clients over their rate.
 
 
+@pytest.mark.slow
 def test_local_clients_over_their_rate_wait_without_threads_and_leave_nothing_behind(
     replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -798,6 +799,7 @@ def _part(client: Stream, size: int) -> int:
     return len(data)
 
 
+@pytest.mark.slow
 def test_parts_of_messages_of_a_key_are_bounded_by_its_rate(replica: KeyedReplica) -> None:
     visitor = replica.visitor("right")
     replica.known.change(visitor.name, rate=1)
@@ -853,6 +855,7 @@ def test_a_key_over_its_rate_is_read_on_none_of_its_connections(replica: KeyedRe
     first.close(), second.close()
 
 
+@pytest.mark.slow
 def test_the_messages_of_a_key_over_its_rate_stay_unread_at_uvicorns_websockets(
     replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -891,6 +894,7 @@ def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedRepl
     transport.close()
 
 
+@pytest.mark.slow
 def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -81,6 +81,7 @@ def scene(name: str, situation: str) -> Iterator[Scene]:
         yield Scene(server, client, situation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "situation"), EACH)
 def test_a_server_that_stops_leaves_no_client_waiting(name: str, situation: str) -> None:
     """The server answers all accepted requests, and closes WebSockets with 1012 and a reason."""
@@ -102,6 +103,7 @@ def test_a_server_that_stops_leaves_no_client_waiting(name: str, situation: str)
         assert seconds_of(lambda: stopping.join(BOUND_S)) < BOUND_S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sends_more", [False, True], ids=["only reads", "sends half a message"])
 # LeRobot's clients accept at most 4 MB; test_http2_front.py tests them.
 @pytest.mark.parametrize("name", ["own port", "GR00T", "vlagents"])
@@ -152,6 +154,7 @@ def test_an_answer_over_shared_memory_arrives_though_a_later_message_is_never_re
         assert reply.error is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "situation"), EACH)
 def test_no_act_is_executed_for_a_client_that_left_before_it_began(
     name: str, situation: str

@@ -24,6 +24,7 @@ from vlagents_ray.serve.fleet import CostCurve
 from vlagents_ray.serve.queue.replica_pace import RobotPlan
 
 
+@pytest.mark.slow
 def test_no_request_is_lost_and_none_overtakes_an_urgent_one() -> None:
     answered = sum(play_drawn(seed).answered for seed in range(300))
     assert answered > 300 * 20, "the worlds had too few answers for a judgement"
@@ -43,6 +44,7 @@ def test_a_lone_robot_is_answered_as_soon_with_slack_as_without(
     assert after.robots[0].ages == before.robots[0].ages
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kinds", "robots"),
     [([(50, 10.0)], 330), ([(50, 10.0), (8, 10.0)], 56), ([(50, 10.0), (1, 5.0)], 24)],
@@ -55,6 +57,7 @@ def test_slack_serves_a_third_more_robots_with_chunks_of_50(
     assert play(PI0, round(robots / 1.3), False, *kinds).share() < 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("costs", "kinds", "robots"),
     [
@@ -75,6 +78,7 @@ def test_robots_that_begin_at_once_do_not_ask_at_once_for_ever(
         assert robot.starved <= 0.02 * robot.ticks, robot.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinds", [[(50, 10.0)], [(8, 10.0)], [(50, 10.0), (8, 10.0)]])
 def test_at_half_load_no_action_is_older_for_it(kinds: list[tuple[int, float]]) -> None:
     half = {50: 120, 8: 16}[kinds[0][0]] if len(kinds) == 1 else 19
@@ -109,6 +113,7 @@ def test_a_robot_without_an_slo_is_paced_by_what_it_does() -> None:
     assert world.queue.depth() <= 32, "robots must wait before they send, not in the queue"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("states_slo", [True, False])
 def test_robots_that_all_start_at_once_are_soon_in_time(states_slo: bool) -> None:
     robots = fleet(400, (50, 10.0))

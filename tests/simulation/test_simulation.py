@@ -184,6 +184,7 @@ def outlive_connections(replica: Replica) -> None:
     forget_episodes(replica)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("world", "sign"),
     [

@@ -29,10 +29,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 
-# Excluded markers: mutants run only against tests that take seconds.
+# Excluded markers: mutants run only against tests that need no other resources.
 MARKS = (
     "not (ray or server or hosts or sim or vulkan or gpu or browser or node or compiler or alone"
-    " or slow or integration)"
+    " or integration)"
 )
 RELATED_FILES = 6  # number of test files that run first
 

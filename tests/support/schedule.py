@@ -11,7 +11,7 @@ import itertools
 import json
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,9 @@ import pytest
 
 _SECONDS = Path(__file__).parent / "seconds.json"
 _LEAST_S = 8.0  # shortest duration of a file that is recorded
+# A test is marked `slow` if all its cases take more than a second together. Other tests of the same
+# run make them several times slower.
+_SLOW_S = 4.0
 # These tests simulate several hosts each. They run one at a time, since two of them would starve
 # each other of CPU.
 _CLUSTERS = "tests/cluster/"
@@ -70,22 +73,38 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Record the duration of each file if VLAGENTS_TEST_SECONDS is set and several processes run
-    tests.
+    """List the tests that should be marked `slow`, where `-m` leaves such tests out. Record the
+    duration of each file if VLAGENTS_TEST_SECONDS is set and several processes run tests.
     """
+    reports = [
+        report
+        for report in itertools.chain(*terminalreporter.stats.values())
+        if isinstance(report, pytest.TestReport)
+    ]
+    if "slow" in config.option.markexpr:
+        for test, took in not_marked_slow(reports).items():
+            terminalreporter.write_line(f"not marked slow: {test} took {took:.0f} s in all")
     name = os.environ.get("VLAGENTS_TEST_SECONDS")
-    if name is None or not config.getoption("numprocesses", None):
-        return
+    if name is not None and config.getoption("numprocesses", None):
+        _record(reports, config.option.markexpr, Path(name))
+
+
+def not_marked_slow(reports: Iterable[pytest.TestReport]) -> dict[str, float]:
+    """Return the tests without the marker `slow` all cases of which took more than `_SLOW_S`
+    together, and their durations in seconds, longest first.
+    """
     took: Counter[str] = Counter()
-    for report in itertools.chain(*terminalreporter.stats.values()):
-        if isinstance(report, pytest.TestReport):
-            took[report.nodeid.partition("::")[0]] += report.duration
-    file = Path(name)
+    for report in reports:
+        if "slow" not in report.keywords:
+            took[report.nodeid.partition("[")[0]] += report.duration
+    return {test: s for test, s in took.most_common() if s > _SLOW_S}
+
+
+def _record(reports: Iterable[pytest.TestReport], tier: str, file: Path) -> None:
+    took: Counter[str] = Counter()
+    for report in reports:
+        took[report.nodeid.partition("::")[0]] += report.duration
     known = json.loads(file.read_text()) if file.exists() else {}
-    others = {
-        test: s for test, s in known.get(config.option.markexpr, {}).items() if test not in took
-    }
-    known[config.option.markexpr] = others | {
-        test: round(s, 1) for test, s in took.items() if s >= _LEAST_S
-    }
+    others = {test: s for test, s in known.get(tier, {}).items() if test not in took}
+    known[tier] = others | {test: round(s, 1) for test, s in took.items() if s >= _LEAST_S}
     file.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")

@@ -305,6 +305,7 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cls", [GoodAgent, SharesItsLock, Prepares, LocksItsTokenizer])
 def test_a_good_agent_passes(cls: type[GoodAgent]) -> None:
     check_agent(cls())

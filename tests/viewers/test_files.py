@@ -170,6 +170,7 @@ def test_a_viewer_of_rerun_gets_what_runs(
     assert (viewer.episodes, viewer.dropped, viewer.error) == (1, 0, None)
 
 
+@pytest.mark.slow
 @pytest.mark.library("rerun")
 def test_a_viewer_of_rerun_that_stands_still_holds_up_nothing(
     rerun_viewer: tuple[str, subprocess.Popen[bytes]],

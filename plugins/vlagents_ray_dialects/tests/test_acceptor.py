@@ -11,6 +11,7 @@ from eval_fakes import wait_for
 from vlagents_ray_dialects import acceptor
 
 
+@pytest.mark.slow
 def test_connections_that_their_clients_have_ended_neither_count_nor_delay_the_next(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

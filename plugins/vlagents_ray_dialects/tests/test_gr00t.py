@@ -366,6 +366,7 @@ def limited(open_dialect: Any, monkeypatch: pytest.MonkeyPatch) -> Limited:
     return Limited(open_dialect, monkeypatch)
 
 
+@pytest.mark.slow
 def test_a_keys_rate_holds_wherever_the_replica_is(limited: Limited, replicas: Replicas) -> None:
     with limited.client("slow", rate=1e-3) as client, limited.client("lab") as other:
         assert client.ping()["status"] == "ok"
@@ -384,6 +385,7 @@ def test_a_keys_rate_holds_wherever_the_replica_is(limited: Limited, replicas: R
         wait_for(lambda: _went_on(client))
 
 
+@pytest.mark.slow
 def test_who_is_over_the_rate_of_its_key_is_not_read_for_a_while(limited: Limited) -> None:
     with limited.client("greedy", rate=1e-3) as client, limited.client("lab") as other:
         client.ping()
@@ -526,6 +528,7 @@ def test_a_slow_and_a_greedy_client_hold_up_nobody(open_dialect) -> None:
         context.term()
 
 
+@pytest.mark.slow
 @pytest.mark.own_process
 def test_mutated_messages_get_an_error_or_an_answer(open_dialect, replicas: Replicas) -> None:
     """A valid client acts all the time; memory and the number of threads do not grow."""
@@ -567,6 +570,7 @@ def test_mutated_messages_get_an_error_or_an_answer(open_dialect, replicas: Repl
         context.term()
 
 
+@pytest.mark.slow
 def test_a_dialect_that_ends_answers_every_request(replicas: Replicas) -> None:
     config = GR00TDialect.Config(port=free_port())
     context = GatewayContext(
@@ -613,6 +617,7 @@ PAUSES_S = (0.0, 0.001, 0.002, 0.01, 0.03, 0.1)
 RESTARTS = 3
 
 
+@pytest.mark.slow
 def test_no_client_waits_for_ever_when_the_gateway_restarts_however_often_it_asks(
     replicas: Replicas,
 ) -> None:

@@ -122,6 +122,7 @@ MESSAGES: dict[str, Callable[[], tuple[bytes, list[bytes]]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESSAGES)
 def test_a_message_without_a_key_leaves_nothing_behind(gateway: Gateway, name: str) -> None:
     with gateway.connect(zmq.REQ) as robot:
@@ -141,6 +142,7 @@ def test_a_message_without_a_key_leaves_nothing_behind(gateway: Gateway, name: s
         wait_for(lambda: resident() - before < MEMORY)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chooses", ["one part each", "one identity each", "nothing"])
 def test_a_flood_without_keys_takes_no_place_and_no_thread(gateway: Gateway, chooses: str) -> None:
     """There are eight places. During the flood a client with a key can connect, and is answered
@@ -236,6 +238,7 @@ def test_a_client_with_a_revoked_key_is_a_stranger_again(gateway: Gateway) -> No
         assert gateway.clients == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cause", ["idle", "revoked key", "place given to another"])
 def test_a_client_that_loses_its_place_keeps_its_connection(
     gateway: Gateway, monkeypatch: pytest.MonkeyPatch, cause: str

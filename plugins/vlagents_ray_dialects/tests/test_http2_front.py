@@ -114,6 +114,7 @@ def test_a_connection_with_too_many_frames_stays_open_so_that_its_client_does_no
     assert 0.4 < time.monotonic() - begun < 5
 
 
+@pytest.mark.slow
 def test_frames_above_the_rate_wait(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http2_front, "_FRAMES_PER_S", 1e-6)
     monkeypatch.setattr(http2_front, "_FRAMES_AT_ONCE", 10)
@@ -269,6 +270,7 @@ def test_the_last_answer_reaches_a_client_that_reads_it_after_the_front_closes(
     assert received == ANSWER
 
 
+@pytest.mark.slow
 def test_no_stranger_and_no_client_that_does_not_read_delays_a_stop(stopped: StoppedServer) -> None:
     """The stranger's connection ends immediately, the client's connection after the time for its
     answers.

@@ -305,6 +305,7 @@ class Counted(Mirror):
         return [session.act(one) for session, one in zip(sessions, obs, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sent_as", ["msgpack", "realtime"])
 @pytest.mark.parametrize("wrong", sorted(WRONG))
 def test_a_wrong_request_says_what_is_wrong_and_nothing_is_acted_on(

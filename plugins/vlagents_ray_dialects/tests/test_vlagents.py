@@ -455,6 +455,7 @@ def test_the_clients_memory_is_read_in_place(open_dialect) -> None:
         segment.unlink()
 
 
+@pytest.mark.slow
 def test_a_slow_a_dead_and_a_silent_client_hold_up_nobody(open_dialect, replicas: Replicas) -> None:
     # The good client is silent for a shorter time, even on a busy machine.
     port = open_dialect("vlagents", idle_s=4.0)

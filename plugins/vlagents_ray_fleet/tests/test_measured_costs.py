@@ -95,6 +95,7 @@ def planned(costs: dict[str, Any]) -> FleetPlan:
     )
 
 
+@pytest.mark.slow
 def test_the_costs_that_a_server_measures_make_the_plan_that_its_robots_show() -> None:
     config = NoopConfig(chunk=ROWS, delta=True, base_ms=BASE_MS, per_item_ms=ROW_MS)
     with serving(Noop(config)) as url:

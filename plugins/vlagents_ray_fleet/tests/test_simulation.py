@@ -155,6 +155,7 @@ def test_a_robot_notices_a_lost_machine_later_than_an_ended_connection() -> None
     assert starved[1] == pytest.approx(10 * 3.0 - 8, abs=4)
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_requests_take_seconds() -> None:
     world = World()
     for _ in range(40):

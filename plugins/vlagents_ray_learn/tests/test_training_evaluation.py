@@ -127,6 +127,7 @@ def test_an_evaluation_that_fails_has_taken_its_time(
     assert evaluation.play_if_due(2) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_an_agent_of_this_process_has_the_results_of_a_served_one(
     tmp_path: Path, agent: Proportional, served: Replicas, num_envs: int

@@ -156,6 +156,7 @@ def test_what_is_beside_the_replicas_is_sent_when_it_has_changed() -> None:
     assert first["replicas"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("behind", "size", "sent"), [(2, 1, 4), (None, PICTURES, 100)], ids=["messages", "bytes"]
 )

@@ -223,6 +223,7 @@ def send(
     observe(watched, session, Request("act", obs), reply, files)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*MESSAGES, "all in turn"])
 def test_many_messages_of_the_largest_size_leave_bounded_memory_in_the_live_observer(
     budgets: None, kind: str

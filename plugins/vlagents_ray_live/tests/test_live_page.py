@@ -136,6 +136,7 @@ def test_errors_and_sessions_that_ended_are_told(server: LiveServer) -> None:
         assert all(server.view.live.observation(session) is None for session in failing)
 
 
+@pytest.mark.slow
 def test_nothing_is_kept_once_nobody_looks(server: LiveServer) -> None:
     with server.viewer() as viewer:
         ask(viewer)
@@ -192,6 +193,7 @@ def test_a_viewer_who_asks_for_nothing_is_let_go(
         assert "within 0.1 s" in json.loads(viewer.recv(10))["detail"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "headers",
     [
@@ -298,6 +300,7 @@ def test_it_is_there_until_the_end_of_the_context() -> None:
         get(url)
 
 
+@pytest.mark.slow
 def test_a_viewer_does_not_keep_it_from_ending() -> None:
     with page_server(fleet(), ("127.0.0.1", 0), None, name="eval", videos={}.get) as url:
         viewer = open_websocket(

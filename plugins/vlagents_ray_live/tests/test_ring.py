@@ -68,6 +68,7 @@ def pressed(server: LiveServer, session: str) -> dict[str, str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("codec", ["jpeg", "raw"])
 def test_a_press_makes_an_episode(server: LiveServer, settings: LiveConfig, codec: str) -> None:
     with RemoteAgent(server.url, codec=codec) as agent:

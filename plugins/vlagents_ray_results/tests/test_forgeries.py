@@ -182,6 +182,7 @@ def test_the_honest_bundle_holds(forged: Forge) -> None:
     assert len([one for one in found.findings if one.subject.startswith("replay")]) == EPISODES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("column", "value", "rows"), list(one_of_each()))
 def test_a_column_that_is_changed_alone_contradicts_the_bundle(
     forged: Forge, column: str, value: str, rows: str
@@ -204,6 +205,7 @@ def in_real_time(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -319,6 +321,7 @@ def test_a_changed_case_that_would_leave_episodes_out_contradicts_the_bundle(
     assert not forged(update(sql)).holds
 
 
+@pytest.mark.slow
 def test_replayed_episodes_are_drawn_by_a_seed_and_each_can_be(
     honest: Path, tmp_path: Path
 ) -> None:

@@ -197,6 +197,7 @@ def stated(store: Store, subject: str, value: str) -> None:
     store.note_env(store.cases[0].place, env)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", list(itertools.permutations(["", "x", "y"])))
 @pytest.mark.parametrize("subject", STATEMENTS)
 def test_a_part_of_which_nothing_is_known_hides_no_difference_of_the_others(
@@ -212,6 +213,7 @@ def test_a_part_of_which_nothing_is_known_hides_no_difference_of_the_others(
         merge(tmp_path / "out", folders)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", list(itertools.permutations(["", "x", "y"])))
 @pytest.mark.parametrize("subject", STATEMENTS)
 def test_a_run_of_which_nothing_is_known_hides_no_difference_of_the_others(
@@ -229,6 +231,7 @@ def test_a_run_of_which_nothing_is_known_hides_no_difference_of_the_others(
         resume_twice()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", list(itertools.permutations(["", "x", "y"])))
 @pytest.mark.parametrize("subject", ["program", "settings", "wrappers", "weights"])
 def test_a_report_keeps_a_policy_apart_also_after_a_folder_of_which_nothing_is_known(

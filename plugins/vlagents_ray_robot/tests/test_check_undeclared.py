@@ -67,6 +67,7 @@ class Partly(Own):
     contract = Contract(action=ActionSpec(dim=3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "status"),
     [("Own", 3), ("Partly", 3), ("Declared", 0), ("Repeating", 1), ("InPlace", 3)],

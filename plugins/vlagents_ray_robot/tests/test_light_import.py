@@ -32,6 +32,7 @@ HEAVY = {
 HEAVY |= {"lerobot", "pyarrow", "pyspacemouse", "rclpy"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", MODULES)
 def test_no_module_imports_anything_heavy(module: str) -> None:
     code = f"import sys, {module}; print(*sys.modules)"

@@ -221,6 +221,7 @@ REFUSALS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measured", [False, True])
 @pytest.mark.parametrize("refusal", REFUSALS)
 def test_an_operators_target_does_not_run_on_while_the_arm_does_not_follow(

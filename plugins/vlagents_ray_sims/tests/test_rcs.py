@@ -147,6 +147,7 @@ def test_without_assets_the_package_is_not_imported(installed: Path) -> None:
         make_env("rcs/pick")
 
 
+@pytest.mark.slow
 def test_assets_are_looked_for_where_the_packages_keep_them(
     installed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

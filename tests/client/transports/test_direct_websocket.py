@@ -145,6 +145,7 @@ def test_the_key_is_in_no_log(port: int, caplog: pytest.LogCaptureFixture) -> No
     assert not [line for line in client if "the-secret-key" in line]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read_bytes", [0, 4096], ids=["takes nothing", "takes little"])
 @pytest.mark.parametrize("has_tls", [False, True], ids=["plain", "tls"])
 def test_a_proxy_that_hardly_reads_does_not_hold_up_the_sender(
@@ -167,6 +168,7 @@ def test_a_proxy_that_hardly_reads_does_not_hold_up_the_sender(
         assert time.monotonic() - begun < 5  # without a limit, at least 400 s
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read_bytes", [0, 4096], ids=["takes nothing", "takes little"])
 def test_a_connection_that_cannot_send_is_closed_in_time(read_bytes: int) -> None:
     """Its close frame waits behind a message that another thread is sending."""

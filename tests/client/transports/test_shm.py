@@ -111,6 +111,7 @@ def test_outside_of_a_cluster_there_is_no_plasma() -> None:
         RemoteAgent("http://localhost:8000", transport="plasma")
 
 
+@pytest.mark.slow
 @pytest.mark.own_process
 @pytest.mark.usefixtures("here")
 def test_a_connection_that_fails_is_closed_at_once(

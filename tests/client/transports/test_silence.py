@@ -128,6 +128,7 @@ def request(op: Any, name: str, **info: Any) -> Request:
     return Request(op, Obs(info={"name": name, **info}), request_id=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_a_replica_answers_pings_while_its_policy_is_at_work(
     replica: Replica, transport: str
@@ -152,6 +153,7 @@ def test_a_replica_answers_pings_while_its_policy_is_at_work(
     client.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_a_frozen_replica_is_left_and_does_not_act_when_it_continues(
     replica: Replica, transport: str
@@ -173,6 +175,7 @@ def test_a_frozen_replica_is_left_and_does_not_act_when_it_continues(
     other.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_a_replica_that_continues_in_time_is_not_left(replica: Replica, transport: str) -> None:
     watch = Watch(limit_s=60.0)

@@ -289,6 +289,7 @@ def test_a_repeated_episode_replaces_its_videos(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("video", ["none", "failures", "all"])
 def test_exact_images_of_a_trajectory_are_those_that_the_policy_got(
     config: Config, video: str

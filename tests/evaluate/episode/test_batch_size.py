@@ -186,6 +186,7 @@ def outcomes(summary: Summary) -> dict[int, tuple[object, ...]]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trouble", TROUBLES)
 def test_an_episode_that_fails_leaves_those_beside_it_as_they_are(
     run: Callable[..., Summary], trouble: str
@@ -197,6 +198,7 @@ def test_an_episode_that_fails_leaves_those_beside_it_as_they_are(
     assert outcomes(run(trouble, num_envs=3)) == alone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trouble", ["refuses", *EXPLOSIONS])
 def test_an_error_of_a_simulator_of_several_environments_names_its_episode(
     run: Callable[..., Summary], trouble: str
@@ -208,6 +210,7 @@ def test_an_error_of_a_simulator_of_several_environments_names_its_episode(
     assert together.cases[0].infra_failures == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("retries", [1, 2, 3])
 @pytest.mark.parametrize("trouble", ["raises", *AT_RESET])
 def test_an_episode_that_breaks_the_simulator_of_several_loses_no_other_one(
@@ -219,6 +222,7 @@ def test_an_episode_that_breaks_the_simulator_of_several_loses_no_other_one(
     assert together.cases[0].infra_failures == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trouble", ["diverges", "reward", *EXPLOSIONS])
 @pytest.mark.parametrize("num_envs", [1, 4])
 def test_a_simulation_that_diverges_again_under_the_same_actions_is_a_failure_of_the_policy(

@@ -65,6 +65,7 @@ def _equal_policies(number: int, *, sweep: bool, random: np.random.Generator) ->
     return Results(Path("/nowhere"), tuple(cases), (run,), {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "most_pairs", "most_compared", "sweep"),
     [

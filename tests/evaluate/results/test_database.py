@@ -110,6 +110,7 @@ def test_what_a_killed_evaluation_left_is_read_and_only_the_run_that_holds_the_l
     assert states() == ["killed", "complete"]
 
 
+@pytest.mark.slow
 def test_readers_that_look_at_the_lock_stop_no_evaluation(config: Config) -> None:
     begun(config()).close()
     looked = threading.Event()

@@ -59,6 +59,7 @@ def test_nothing_is_known_without_episodes() -> None:
         confidence_sequence(3, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.02, 0.3, 0.5, 0.9])
 def test_the_true_rate_is_missed_no_more_often_than_is_said_whenever_one_looks(rate: float) -> None:
     streams, length, error_rate = 2000, 400, 0.05

@@ -199,6 +199,7 @@ def test_the_page_may_load_nothing_from_elsewhere(operator: PageOperator) -> Non
     assert "http" not in html.replace("http-equiv", "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["stop", "leave"])
 def test_a_trial_is_stopped_by_the_button_or_when_the_page_is_gone(
     tmp_path: Path, operator: PageOperator, how: str

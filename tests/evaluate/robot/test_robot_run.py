@@ -486,6 +486,7 @@ def test_a_policy_that_changed_between_trials_ends_it_without_being_named(tmp_pa
     assert not any(name in str(raised.value) for name in NAMES)
 
 
+@pytest.mark.slow
 def test_a_task_ends_early_once_all_its_policies_are_certain(tmp_path: Path) -> None:
     config = plan(tmp_path / "out", suite={"episodes": 20}, stop={"target": 0.5})
     order = names_by_trial(config)

@@ -71,6 +71,7 @@ def test_every_policy_plays_every_scene_once(
         assert all(sorted(names) == everyone for names in orders)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(
     keys,

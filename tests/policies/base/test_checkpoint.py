@@ -178,6 +178,7 @@ CHANGES: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES.values(), ids=list(CHANGES))
 def test_what_changes_the_weights_changes_the_digest(
     change: Callable[[Path], object], folder: Path

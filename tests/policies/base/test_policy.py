@@ -87,6 +87,7 @@ def loaded(**config: Any) -> Wobble:
     return policy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config", [{"actions": "queue"}, {"actions": "ensemble"}, {"batch_sizes": [1, 2, 4]}]
 )

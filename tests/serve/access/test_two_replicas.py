@@ -63,6 +63,7 @@ def statuses(port: int, paths: list[str], sessions: list[str]) -> Counter[int]:
     return counted
 
 
+@pytest.mark.slow
 def test_a_key_has_its_rate_at_each_replica(replicas: list[int]) -> None:
     """A burst may contain the requests of one second. Requests at one replica do not count at the
     other.

@@ -106,6 +106,7 @@ def bearer(token: str) -> dict[str, str]:
     return {"authorization": f"Bearer {token}"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
     [
@@ -159,6 +160,7 @@ def test_only_the_page_itself_is_read_without_a_key(
     assert (answer.status_code, reached) == ((200, [path]) if is_served else (401, []))
 
 
+@pytest.mark.slow
 def test_who_asks_often_without_a_key_is_answered_as_late_as_with_a_wrong_one(
     endpoint: Endpoint,
 ) -> None:
@@ -218,6 +220,7 @@ def test_a_websocket_is_refused_before_it_is_accepted(endpoint: Endpoint) -> Non
         assert json.loads(refused.value.response.body or b"")["status"] == status
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["no key", "a wrong key", "a key of another application"])
 @pytest.mark.parametrize("way", ["a path", "an upload", "an unknown path"])
 def test_a_connection_without_a_right_key_gets_few_answers(
@@ -315,6 +318,7 @@ def test_a_key_holds_no_more_sessions_than_it_may(endpoint: Endpoint, transport:
     wait_for(lambda: not any(name.startswith("arm/") for name in endpoint.engine.sessions.ids()))
 
 
+@pytest.mark.slow
 def test_too_many_requests_are_told_when_to_come_again(endpoint: Endpoint) -> None:
     found = [endpoint.get("/v1/metadata", bearer(endpoint.tokens["slow"])) for _ in range(5)]
     limited = [headers for status, headers, _ in found if status == 429]
@@ -458,6 +462,7 @@ def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(
                 deaf.shutdown(socket.SHUT_RDWR)
 
 
+@pytest.mark.slow
 def test_a_websocket_that_stays_silent_or_sends_half_a_message_is_cut_off() -> None:
     engine = Engine(Big())
     engine.start()

@@ -109,6 +109,7 @@ def test_the_end_of_a_replica_waits_for_the_answer_to_a_message(
     assert closed.value.rcvd.code == 1012
 
 
+@pytest.mark.slow
 def test_a_client_that_answers_no_ping_is_cut_off(
     port: int, echo: SlowEcho, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -111,6 +111,7 @@ def test_requests_of_robots_pass_by_serve_once_it_has_shown_the_prefix(server: S
     assert server.through_serve == {f"{server.prefix}/v1/reset": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "path"),
     [("GET", "/v1/metadata"), ("GET", "/v1/act"), ("POST", "/v1/other"), ("POST", "/v1/act/")],

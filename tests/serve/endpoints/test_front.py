@@ -44,6 +44,7 @@ def _close_of(url: str, size: int) -> tuple[int, str]:
     raise AssertionError("the server answered a message over its limit")
 
 
+@pytest.mark.slow
 def test_a_message_over_the_limit_gets_1009_with_a_reason_each_time() -> None:
     with served(APP) as port:
         url = f"ws://127.0.0.1:{port}/"

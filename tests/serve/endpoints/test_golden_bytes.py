@@ -20,6 +20,7 @@ from endpoint_situations import (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("endpoint", "situation"), cases(CORE), ids=case_ids(CORE))
 def test_the_endpoint_answers_with_the_recorded_bytes(
     endpoint: Endpoint, situation: str, tmp_path: Path
@@ -32,6 +33,7 @@ def test_each_situation_of_the_endpoint_is_recorded(endpoint: Endpoint) -> None:
     require_each_situation_recorded(endpoint)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("endpoint", "kind"), costs(CORE))
 def test_each_request_is_charged_to_the_key_exactly_once(
     endpoint: Endpoint, kind: str, tmp_path: Path

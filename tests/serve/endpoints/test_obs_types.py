@@ -188,6 +188,7 @@ def is_fine(status: int, field: str) -> bool:
     return status < 500 or (field == "deadline_ms" and status == 504)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("op", ["reset", "act", "close"])
 def test_a_frame_with_any_value_in_any_field_is_answered(
@@ -208,6 +209,7 @@ def test_a_frame_with_any_value_in_any_field_is_answered(
     assert POLICY.wrong == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", [field for field in FIELDS if "camera" not in field])
 @pytest.mark.parametrize("op", ["reset", "act"])
 @pytest.mark.parametrize("as_form", [False, True])

@@ -296,6 +296,7 @@ def test_http_1_0_may_keep_its_connection(served_replica: Replica) -> None:
             assert (status, headers["connection"]) == (200, "keep-alive")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sent", [b"", b"POST ", "half a body"], ids=str)
 def test_a_request_that_does_not_arrive_is_answered_408(
     sent: bytes | str, monkeypatch: pytest.MonkeyPatch
@@ -408,6 +409,7 @@ def test_answers_at_the_servers_port_name_the_own_port(served_replica: Replica) 
             assert client.ask(served_replica.request("act"))[0] == 200
 
 
+@pytest.mark.slow
 def test_the_client_uses_the_own_port_and_the_servers_port_if_that_is_gone(
     served_replica: Replica,
 ) -> None:
@@ -507,6 +509,7 @@ class OwnPortWithFailures:
         self._listener.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failure", ["lost call", "firewall", "full"])
 def test_an_own_port_that_could_not_be_used_is_used_again_later_and_no_call_is_lost_for_it(
     served_replica: Replica, failure: str, monkeypatch: pytest.MonkeyPatch

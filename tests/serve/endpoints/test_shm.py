@@ -159,6 +159,7 @@ def test_a_late_reply_is_discarded_and_its_memory_is_not_reused_meanwhile(
     transport.close()
 
 
+@pytest.mark.slow
 @pytest.mark.own_process
 def test_neither_descriptors_in_a_message_nor_a_killed_client_leave_anything(
     served: tuple[Engine, ShmServer],
@@ -504,6 +505,7 @@ def _malformed_messages(server: UnixServer, seconds: float) -> tuple[int, socket
     return answers, connection
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("endpoint", ["shm", "plasma"])
 def test_malformed_messages_of_a_client_are_read_at_a_low_rate_and_disturb_no_other_client(
     served: tuple[Engine, ShmServer],

@@ -198,6 +198,7 @@ def test_an_image_that_cannot_be_decoded_is_its_robots_error_alone() -> None:
         ask([first], "act", LONG)
 
 
+@pytest.mark.slow
 def test_eight_messages_are_ready_in_a_third_of_the_time_of_one_thread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -143,6 +143,7 @@ def test_many_small_fragments_end_their_connection(endpoint: OwnPortServer) -> N
             client.recv(5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("floods", [True, False])
 def test_who_stays_after_a_wrong_message_is_cut_off(
     endpoint: OwnPortServer, floods: bool, monkeypatch: pytest.MonkeyPatch

@@ -104,6 +104,7 @@ def timestamps() -> Iterator[None]:
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("timestamps")
 @pytest.mark.parametrize("behind", ["an act", "a process that stood still"])
 @pytest.mark.parametrize("transport", ["shm", "websocket"])
@@ -197,6 +198,7 @@ def test_a_machine_that_is_always_starved_refuses_only_what_may_have_waited() ->
     assert 0.35 < longest_s < 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sent", "deadline_ms"), [("in the pause", 300.0), ("in the pause", 60e3), ("after it", 300.0)]
 )

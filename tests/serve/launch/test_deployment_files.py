@@ -81,6 +81,7 @@ def test_a_file_says_where_to_listen_and_nobody_is_let_in_by_default(tmp_path: P
     assert (http.host, http.port) == (EVERYWHERE, 8123)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "file",
     [*sorted((ROOT / "deployments").glob("*.yaml")), ROOT / "examples" / "raptor" / "raptor.yaml"],

@@ -216,6 +216,7 @@ def test_a_policys_error_is_its_sessions_alone_and_its_text_stays_in_the_log(
     wait_for(lambda: "/no/path/of/ours" in capfd.readouterr().err, 10)
 
 
+@pytest.mark.slow
 def test_what_the_replica_drops_the_child_forgets() -> None:
     child = agent()
     one = Engine(child)
@@ -263,6 +264,7 @@ def while_acting(
     return later
 
 
+@pytest.mark.slow
 def test_the_child_prepares_observations_while_the_batch_before_runs(preparing: Engine) -> None:
     requests = [("b", Request("act", observation(2.0))), ("c", Request("act", observation(3.0)))]
     told = [info(reply.get(timeout=30)) for reply in while_acting(preparing, requests)]
@@ -273,6 +275,7 @@ def test_the_child_prepares_observations_while_the_batch_before_runs(preparing: 
     assert min(one["ahead_s"] for one in told) > 0.1
 
 
+@pytest.mark.slow
 def test_an_observation_that_cannot_be_prepared_there_fails_its_own_request(
     preparing: Engine,
 ) -> None:
@@ -285,6 +288,7 @@ def test_an_observation_that_cannot_be_prepared_there_fails_its_own_request(
     assert info(right)["prepared"] == 3.0
 
 
+@pytest.mark.slow
 def test_an_observation_that_no_batch_takes_leaves_nothing_in_the_child(preparing: Engine) -> None:
     first = asked(preparing, "a", Request("act", observation(batch_s=0.5)))
     wait_for(lambda: preparing.queue.depth() == 0)
@@ -329,6 +333,7 @@ def test_a_row_with_the_observation_of_another_session_sends_it(preparing: Engin
     assert [act.info["value"] for act in acts] == [5.0, 5.0]
 
 
+@pytest.mark.slow
 def test_an_observation_that_is_acted_on_again_is_sent_again(
     preparing: Engine, able: Engine
 ) -> None:
@@ -346,6 +351,7 @@ def test_an_observation_that_is_acted_on_again_is_sent_again(
     assert isinstance(act, Act)
 
 
+@pytest.mark.slow
 def test_the_memory_of_the_childs_gpu_is_the_replicas(
     preparing: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -396,6 +402,7 @@ def test_a_child_that_has_ended_leaves_the_other_metrics_of_the_replica() -> Non
     engine.close()
 
 
+@pytest.mark.slow
 def test_a_child_whose_batches_all_fail_is_replaced_as_a_replica_is() -> None:
     one = Engine(agent())
     one.start()
@@ -420,6 +427,7 @@ def test_a_session_moves_between_replicas_with_all_its_state(engine: Engine, oth
     assert (told["seen"], told["acts"], told["pid"] != first["pid"]) == ([1, 2, 3], 2, True)
 
 
+@pytest.mark.slow
 def test_a_session_that_cannot_move_stays(other: Engine) -> None:
     one = Engine(agent("Unpicklable"))
     one.start()
@@ -429,6 +437,7 @@ def test_a_session_that_cannot_move_stays(other: Engine) -> None:
     one.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ends", "status"), [("is killed", "-9"), ("exits in an act", "7")])
 def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy(
     ends: str, status: str
@@ -451,6 +460,7 @@ def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy(
     one.close()
 
 
+@pytest.mark.slow
 def test_a_child_whose_accelerator_failed_ends_so_that_the_replica_is_replaced() -> None:
     one = Engine(agent())
     one.start()
@@ -463,6 +473,7 @@ def test_a_child_whose_accelerator_failed_ends_so_that_the_replica_is_replaced()
     one.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("policy", "config", "said"),
     [
@@ -490,6 +501,7 @@ def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any],
     one.close()
 
 
+@pytest.mark.slow
 def test_the_child_ends_with_its_replica_that_is_killed() -> None:
     code = (
         "import sys, time\n"
@@ -577,6 +589,7 @@ def test_an_ability_of_the_loaded_policy_is_used_while_it_acts(able: Engine) -> 
         found.dance(observation(), 1)
 
 
+@pytest.mark.slow
 def test_a_call_of_the_loaded_policy_does_not_wait_for_a_running_act() -> None:
     one = Engine(agent("ActsAfterRest"))
     one.start()
@@ -591,6 +604,7 @@ def test_a_call_of_the_loaded_policy_does_not_wait_for_a_running_act() -> None:
     one.close()
 
 
+@pytest.mark.slow
 def test_an_error_of_a_call_of_the_loaded_policy_arrives_with_its_code() -> None:
     one = Engine(agent("ActsAfterRest"))
     one.start()
@@ -633,6 +647,7 @@ def test_a_push_to_a_child_that_dies_is_refused_and_leaves_nothing() -> None:
     served.close()
 
 
+@pytest.mark.slow
 def test_the_child_drops_versions_that_nobody_acts_with_and_gives_others_to_new_replicas() -> None:
     served, _ = learner("Counting")
     for number in range(1, 5):
@@ -670,6 +685,7 @@ def test_handles_of_a_learners_gpu_are_opened_by_the_child(monkeypatch: pytest.M
     served.close()
 
 
+@pytest.mark.slow
 def test_a_policy_in_a_child_process_says_whether_its_chunks_go_on_from_a_plan() -> None:
     settings = Settings("mirror_policy:CountingPolicy", {}, 16, "1")
     policy = ChildAgent(ChildProgram(sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}"}))

@@ -175,6 +175,7 @@ def test_an_environment_without_this_package_or_with_another_version_of_it(bare:
         probe(bare)
 
 
+@pytest.mark.slow
 def test_the_policy_is_built_where_it_will_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

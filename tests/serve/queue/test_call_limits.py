@@ -344,6 +344,7 @@ class Forking(Agent):
         return self.__dict__
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["returns", "exits"])
 @pytest.mark.parametrize("op", OPS)
 def test_a_child_that_the_policy_forks_ends_with_the_call_and_answers_nobody(

@@ -205,6 +205,7 @@ class Moves(RuleBasedStateMachine):
         return places[0] if places else None
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_sessions_survive_any_order_of_moves_pushes_and_rests(served: Replicas) -> None:
     class Served(Moves):

@@ -305,6 +305,7 @@ def test_of_two_states_that_a_fault_left_the_newest_moves(
     assert len(b.sessions) == 0
 
 
+@pytest.mark.slow
 def test_a_session_whose_export_takes_too_long_stays(
     replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -433,6 +434,7 @@ def test_a_slow_replica_that_was_given_a_session_is_waited_for(
         assert obeys(engine, f"robot-{number}") == (f"{number}", 1)
 
 
+@pytest.mark.slow
 def test_no_request_waits_for_a_replica_that_hangs_while_it_is_to_release_a_session(
     replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -469,6 +471,7 @@ def test_no_request_waits_for_a_replica_that_hangs_while_it_is_to_release_a_sess
     assert obeys(b) == ("episode 1", 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["dead", "frozen"])
 @pytest.mark.parametrize("silent_s", [0.0, 60.0])
 def test_no_search_asks_a_replica_that_was_silent_a_moment_ago(

@@ -103,6 +103,7 @@ def test_parameters_that_the_first_act_makes_can_be_pushed(
     assert served.act("a") == (2, 2)
 
 
+@pytest.mark.slow
 @AGENTS
 def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pushed_to_it(
     serving: Callable[..., Engine], agent: type[Gain]
@@ -153,6 +154,7 @@ def test_robots_keep_the_pinned_weights_unless_they_follow(
         served.reset("pinned", weights=7)
 
 
+@pytest.mark.slow
 @AGENTS
 @pytest.mark.parametrize(
     ("pushed", "error"),
@@ -220,6 +222,7 @@ def test_a_learner_that_dies_between_the_phases_leaves_the_last_version(
     assert served.act("a") == (0, 0.0)
 
 
+@pytest.mark.slow
 @AGENTS
 def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(
     serving: Callable[..., Engine], agent: type[Gain]
@@ -260,6 +263,7 @@ class Slow(Doubled):
         return super().act_batch(obs, sessions)
 
 
+@pytest.mark.slow
 def test_a_few_bytes_are_staged_within_20_ms_beside_slow_acts(
     serving: Callable[..., Engine],
 ) -> None:
@@ -286,6 +290,7 @@ def test_a_few_bytes_are_staged_within_20_ms_beside_slow_acts(
     assert np.median(staged_s) < 0.02
 
 
+@pytest.mark.slow
 @AGENTS
 def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(
     serving: Callable[..., Engine], agent: type[Gain]

@@ -87,6 +87,7 @@ def require_right(agent: Upstream, of: list[Any]) -> None:
         np.testing.assert_array_equal(act.action, expected(i))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["openpi", "openpi-batch"])
 def test_the_rows_of_a_lost_lane_are_asked_over_the_others(
     opened: Open, start: Any, protocol: str
@@ -116,6 +117,7 @@ PIXELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", sorted(PIXELS))
 def test_connections_that_ended_while_nobody_acted_cost_a_row_nothing(
     opened: Open, start: Any, protocol: str
@@ -171,6 +173,7 @@ def test_without_any_upstream_a_request_is_answered_as_for_a_lost_replica(
     assert ability(agent, ChecksHealth) is None  # restarting the replica would not help
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "why"), [(SLOW, "no answer within 0.5 s"), (CLOSED, "received 1000")]
 )
@@ -212,6 +215,7 @@ def test_the_connection_of_an_ended_session_is_closed(opened: Open, start: Any) 
     wait_for(lambda: not agent._sessions._clients)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["openpi", "vla_eval"])
 def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(
     protocol: str, start: Any, tmp_path: Path
@@ -276,6 +280,7 @@ DEAF: dict[str, tuple[bytes | None, dict[str, Any]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read_bytes", [0, 4096], ids=["takes nothing", "takes little"])
 @pytest.mark.parametrize("protocol", DEAF)
 def test_an_upstream_that_hardly_reads_keeps_no_act_beyond_its_time(

@@ -301,6 +301,7 @@ def test_an_image_that_is_no_news_holds_the_arm(change: str) -> None:
         assert robot.holds == f"no new message of {CAMERA} for more than 0.3 s"
 
 
+@pytest.mark.slow
 def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     server = contextlib.ExitStack()
     url = f"http://127.0.0.1:{server.enter_context(ahead_server(Ahead()))}"
@@ -395,6 +396,7 @@ def test_a_policy_for_another_robot_is_refused(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", ["joints", "nothing"])
 @pytest.mark.parametrize("declared", [False, True])
 def test_the_check_of_a_robot_behind_topics_moves_nothing(
@@ -428,6 +430,7 @@ def test_the_check_of_a_robot_behind_topics_moves_nothing(
     assert ("NOT CHECKED" in printed) == ("--policy URL" in printed) == (not states_meaning)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", ["of a simulation", "that hangs"])
 def test_only_a_camera_without_new_messages_is_frozen(camera: str) -> None:
     with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:

@@ -168,6 +168,7 @@ def test_a_wrong_setting_is_an_error_that_names_it_and_the_cure(
     assert str(error.value).startswith("arm.yaml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", WRONG)
 def test_a_file_that_cannot_be_read_is_an_error_that_names_it(mistake: str, tmp_path: Path) -> None:
     text, word = WRONG[mistake]
