@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from collections import Counter
@@ -17,6 +18,8 @@ from vlagents_ray import ConnectionLost, NotReset, RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.client.transports.serve_handle import ReplicaNodes
 from vlagents_ray.serve.launch.server import Server
+
+BY_HANDLE_OR_SHM: tuple[TransportName, ...] = ("handle", "shm")
 
 
 @pytest.fixture(scope="module")
@@ -78,23 +81,33 @@ def test_a_caller_learns_on_which_nodes_the_replicas_are_and_of_no_application_n
     assert ReplicaNodes("Nobody").query() == {}
 
 
-@pytest.mark.parametrize("transport", ["handle", "shm"])
-def test_a_dead_replica_ends_its_own_sessions_and_no_others(
-    server: Server, transport: TransportName
-) -> None:
-    agents = [RemoteAgent("serve://Reacher", transport=transport, resume=False) for _ in range(8)]
-    pids = spread(agents, evenly=True)
-    check(agents, pids, 5)
-    os.kill(pids[0], signal.SIGKILL)
-    for i, agent in enumerate(agents):
-        if pids[i] == pids[0]:
-            with pytest.raises(ConnectionLost):
-                agent.act(obs(0))
-            with pytest.raises(NotReset):
-                agent.act(obs(0))
-        else:
-            assert agent.act(obs(0)).info["instruction"] == f"task {i}"
-    for agent in agents:
-        agent.close()
+def test_a_dead_replica_ends_its_own_sessions_and_no_others(server: Server) -> None:
+    """One replica is killed for both transports: when its replacement joins, sessions would move
+    while the test runs.
+    """
+    agents = [
+        RemoteAgent("serve://Reacher", transport=transport, resume=False)
+        for transport in BY_HANDLE_OR_SHM
+        for _ in range(8)
+    ]
+    with contextlib.ExitStack() as stack:
+        for agent in agents:
+            stack.callback(agent.close)
+        pids = spread(agents, evenly=True)
+        check(agents, pids, 5)
+        os.kill(pids[0], signal.SIGKILL)
+
+        ended: Counter[str] = Counter()
+        for i, agent in enumerate(agents):
+            if pids[i] == pids[0]:
+                ended[agent.transport] += 1
+                with pytest.raises(ConnectionLost):
+                    agent.act(obs(0))
+                with pytest.raises(NotReset):
+                    agent.act(obs(0))
+            else:
+                assert agent.act(obs(0)).info["instruction"] == f"task {i}"
+    assert ended.keys() == set(BY_HANDLE_OR_SHM)
+
     assert agents[0].reset(obs(0), "elsewhere")["instruction"] == "elsewhere"
     agents[0].close()

@@ -290,6 +290,29 @@ def test_a_replica_that_joins_gets_its_share_after_one_comparison() -> None:
     served.close()
 
 
+def test_sessions_that_end_or_begin_while_the_others_answer_are_counted_as_they_are_then() -> None:
+    """The loads that the other replicas report count sessions that have left this replica."""
+    served = Replicas([Counting()])
+    [engine] = served.engines
+    agents = [served.agent() for _ in range(12)]
+    for agent in agents:
+        agent.reset(Obs())
+
+    class Moving(Beside):
+        """Reports its load when sessions of the first replica have just moved to it."""
+
+        async def some_loads(self, near: Collection[ClientLocation] = ()) -> list[ReplicaLoad]:
+            for agent in agents[6:]:
+                agent.close()
+            return [replace(self.held[0], sessions=6)]
+
+    neighbours = Moving(load("b", 0))
+    mine = Rebalancer(engine, neighbours, lambda sessions: load("me", sessions))
+    asyncio.run(mine.compare())
+    served.close()
+    assert not mine._uneven
+
+
 def test_a_replica_that_announces_itself_is_compared_with_at_once() -> None:
     served = Replicas([Counting()])
     [engine] = served.engines

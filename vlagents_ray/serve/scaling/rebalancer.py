@@ -332,13 +332,12 @@ class Rebalancer:
         mine = self.load()
         excess = _EVEN
         has_joined = False
-        active = sessions.movable_by_connection(_ACTIVE_S)
-        asked = drain_list.asked_within(_SETTLE_S)
         if mine.sessions > 1 and mine.accepts:  # a single session is never too many
             siblings = [load for load in await self._siblings.some_loads() if load.accepts]
             has_joined = self._have_joined(siblings)
+            mine = self.load()  # sessions may have begun or ended while the others answered
             if siblings and all(load.version == mine.version for load in siblings):
-                excess = self._excess(mine, siblings, active, asked)
+                excess = self._excess(mine, siblings)
 
         # A temporary imbalance may end by itself, but a replica that has joined would stay empty.
         if excess.amount <= 0 or not (self._uneven or has_joined):
@@ -366,21 +365,17 @@ class Rebalancer:
         self._compared = names | before
         return not is_first and not names <= before
 
-    def _excess(
-        self,
-        mine: ReplicaLoad,
-        siblings: Sequence[ReplicaLoad],
-        active: Counter[str],
-        asked: set[str],
-    ) -> _Excess:
+    def _excess(self, mine: ReplicaLoad, siblings: Sequence[ReplicaLoad]) -> _Excess:
         """Return the excess that this replica should send away.
 
         Args:
             mine: The load of this replica.
             siblings: The loads of the other replicas.
-            active: The number of sessions of each connection that can be requested to reconnect.
-            asked: The connections that were requested to reconnect, and have not left yet.
         """
+        # The number of sessions of each connection that can be requested to reconnect.
+        active = self._engine.sessions.movable_by_connection(_ACTIVE_S)
+        # The connections that were requested to reconnect, and have not left yet.
+        asked = self._engine.drain_list.asked_within(_SETTLE_S)
         if all(load.needs_are_known for load in (mine, *siblings)):
             movable = [
                 session
