@@ -17,7 +17,7 @@ from ray._common.utils import import_attr
 from ray.serve._private.api import call_user_app_builder_with_args_if_necessary
 from ray.serve.exceptions import RayServeException
 
-from vlagents_ray.errors import MissingDependency, PolicyFailed
+from vlagents_ray.errors import MissingDependency, PolicyFailed, PolicyUnavailable
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.app import application
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -212,6 +212,34 @@ def test_other_replicas_call_a_part_by_its_name() -> None:
         "count",
         (1, "two"),
     )
+
+
+@pytest.mark.parametrize("method", ["call_part", *PEER_METHODS])
+def test_an_error_for_another_replica_is_returned(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Serve logs a traceback of an error that is raised."""
+    error = PolicyUnavailable("the policy is loading; try again")
+
+    def fail(*args: Any) -> Any:
+        raise error
+
+    async def fail_later(*args: Any) -> Any:
+        raise error
+
+    one = object.__new__(Bare)
+    vars(one).update(
+        _parts=SimpleNamespace(call=fail_later),
+        _migrator=SimpleNamespace(sessions=None),
+        _rebalancer=None,
+    )
+    if method == "call_part":
+        assert asyncio.run(one.call_part("weights", "newest")) is error
+        return
+    asked = PEER_METHODS[method]
+    failing = fail if asked.part is Rebalancer else fail_later
+    monkeypatch.setitem(PEER_METHODS, method, asked._replace(call=failing))
+    assert asyncio.run(one.peer(method)) is error
 
 
 def test_a_replica_answers_what_waits_before_its_ways_in_and_its_parts_close() -> None:

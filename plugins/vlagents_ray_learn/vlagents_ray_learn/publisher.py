@@ -286,16 +286,16 @@ class AppTarget:
 
         try:
             handle = serve.get_app_handle(self._app)
-            answer = handle.call_part.remote(PART, method, *args)
-            return answer.result(timeout_s=timeout_s)
+            answer = handle.call_part.remote(PART, method, *args).result(timeout_s=timeout_s)
         except ray.exceptions.RayTaskError as error:
-            if isinstance(error.cause, VLAgentsError):
-                raise error.cause from error
             if type(error.cause) is LookupError:  # raised by `ReplicaParts.call`
                 raise _has_no_part(f"serve://{self._app}") from error
             raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
         except (RayServeException, ray.exceptions.RayError, TimeoutError) as error:
             raise _unknown_outcome(f"serve://{self._app}", error) from error
+        if isinstance(answer, VLAgentsError):
+            raise answer
+        return answer
 
 
 class ServerTarget:

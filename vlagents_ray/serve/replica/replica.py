@@ -407,17 +407,23 @@ class PolicyReplica(ClientApi, SiblingApi):
         return self._connection_info()
 
     async def peer(self, method: str, *args: Any) -> Any:
-        """Call one of `PEER_METHODS` for another replica."""
+        """Call one of `PEER_METHODS` for another replica; return its result or error."""
         part, call, _ = PEER_METHODS[method]
-        if part is HeldSessions:
-            return await call(self._migrator.sessions, *args)
-        return call(self._rebalancer, *args)
+        try:
+            if part is HeldSessions:
+                return await call(self._migrator.sessions, *args)
+            return call(self._rebalancer, *args)
+        except VLAgentsError as error:
+            return error
 
     async def call_part(self, part: str, method: str, *args: Any) -> Any:
         """Call a method of a part for the same part of another replica, or for a process of the
-        cluster.
+        cluster; return its result or error.
         """
-        return await self._parts.call(part, method, *args)
+        try:
+            return await self._parts.call(part, method, *args)
+        except VLAgentsError as error:
+            return error
 
     # The replica's periodic tasks.
 

@@ -46,7 +46,11 @@ _MOST_ASKED = 32
 
 
 class SiblingApi(Protocol):
-    """The actor methods that the replicas of an application call on each other."""
+    """The actor methods that the replicas of an application call on each other.
+
+    An error of this package is returned, and not raised: Serve would log it with a traceback,
+    although it is often expected, such as the error of a replica that is still loading.
+    """
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
         """Expect a client that another replica redirects to this replica; return the metadata for
@@ -54,10 +58,14 @@ class SiblingApi(Protocol):
         """
 
     async def peer(self, method: str, *args: Any) -> Any:
-        """Call the method with the given name in `PEER_METHODS`, and return its result."""
+        """Call the method with the given name in `PEER_METHODS`; return its result, or its
+        `VLAgentsError`.
+        """
 
     async def call_part(self, part: str, method: str, *args: Any) -> Any:
-        """Call a method in the `ReplicaPart.sibling_methods` of a part, and return its result."""
+        """Call a method in the `ReplicaPart.sibling_methods` of a part; return its result, or its
+        `VLAgentsError`.
+        """
 
 
 class PeerMethod(NamedTuple):
@@ -139,19 +147,15 @@ class SiblingReplica(Peer):
                 ):
                     raise PeerStarting("the replica is not initialized yet")
                 self._initialized.add(self.name)
-            answer = call_replica(self._actor, method, *args)
-            return await asyncio.wait_for(answer, limit_s)
+            answer = await asyncio.wait_for(call_replica(self._actor, method, *args), limit_s)
         except ray.exceptions.ActorDiedError as error:
             raise PeerEnded(str(error)) from error
-        except ray.exceptions.RayTaskError as error:  # the replica itself has raised the error
-            raise (
-                error.cause
-                if isinstance(error.cause, VLAgentsError)
-                else PeerUnreachable(str(error))
-            ) from error
         except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
-            # The replica hangs, or the network is partitioned.
+            # The replica hangs or has another version, or the network is partitioned.
             raise PeerUnreachable(str(error) or f"no answer within {limit_s} s") from error
+        if isinstance(answer, VLAgentsError):
+            raise answer
+        return answer
 
 
 class ReplicasInCluster:
