@@ -69,8 +69,8 @@ def test_what_runs_alone_is_apart_from_its_file_and_clusters_are_played_by_one_p
 def test_tests_that_should_be_marked_slow_are_listed_with_the_time_of_all_cases() -> None:
     def report(test: str, *markers: str) -> pytest.TestReport:
         keywords = dict.fromkeys(markers, 1)
-        place = ("test_a.py", 1, "a")
-        return pytest.TestReport(test, place, keywords, "passed", None, "call", duration=1.5)
+        location = ("test_a.py", 1, "a")
+        return pytest.TestReport(test, location, keywords, "passed", None, "call", duration=1.5)
 
     cases = [report(f"test_a.py::a[{number}]") for number in range(4)]
     marked = [report(f"test_a.py::b[{number}]", "slow") for number in range(9)]

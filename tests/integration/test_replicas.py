@@ -85,10 +85,10 @@ def test_a_dead_replica_ends_its_own_sessions_and_no_others(server: Server) -> N
     """One replica is killed for both transports: when its replacement joins, sessions would move
     while the test runs.
     """
+    transports = 8 * BY_HANDLE_OR_SHM
     agents = [
         RemoteAgent("serve://Reacher", transport=transport, resume=False)
-        for transport in BY_HANDLE_OR_SHM
-        for _ in range(8)
+        for transport in transports
     ]
     with contextlib.ExitStack() as stack:
         for agent in agents:

@@ -227,19 +227,19 @@ def test_an_error_for_another_replica_is_returned(
     async def fail_later(*args: Any) -> Any:
         raise error
 
-    one = object.__new__(Bare)
-    vars(one).update(
+    replica = object.__new__(Bare)
+    vars(replica).update(
         _parts=SimpleNamespace(call=fail_later),
         _migrator=SimpleNamespace(sessions=None),
         _rebalancer=None,
     )
     if method == "call_part":
-        assert asyncio.run(one.call_part("weights", "newest")) is error
+        assert asyncio.run(replica.call_part("weights", "newest")) is error
         return
     asked = PEER_METHODS[method]
     failing = fail if asked.part is Rebalancer else fail_later
     monkeypatch.setitem(PEER_METHODS, method, asked._replace(call=failing))
-    assert asyncio.run(one.peer(method)) is error
+    assert asyncio.run(replica.peer(method)) is error
 
 
 def test_a_replica_answers_what_waits_before_its_ways_in_and_its_parts_close() -> None:
