@@ -17,7 +17,7 @@ from ray._common.utils import import_attr
 from ray.serve._private.api import call_user_app_builder_with_args_if_necessary
 from ray.serve.exceptions import RayServeException
 
-from vlagents_ray.errors import MissingDependency, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import MessageTooLarge, MissingDependency, PolicyFailed, PolicyUnavailable
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.app import application
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -240,6 +240,20 @@ def test_an_error_for_another_replica_is_returned(
     failing = fail if asked.part is Rebalancer else fail_later
     monkeypatch.setitem(PEER_METHODS, method, asked._replace(call=failing))
     assert asyncio.run(replica.peer(method)) is error
+
+
+@pytest.mark.parametrize("has_plasma", [True, False])
+def test_an_error_for_a_plasma_client_is_returned(has_plasma: bool) -> None:
+    error = MessageTooLarge("frame: expected at most 5 bytes, got 60")
+
+    def fail(length: int) -> Any:
+        raise error
+
+    replica = object.__new__(Bare)
+    plasma = SimpleNamespace(pool=SimpleNamespace(lease=fail)) if has_plasma else None
+    vars(replica).update(_plasma=plasma)
+    returned = asyncio.run(replica.lease(60))
+    assert returned is error if has_plasma else isinstance(returned, PolicyUnavailable)
 
 
 def test_a_replica_answers_what_waits_before_its_ways_in_and_its_parts_close() -> None:

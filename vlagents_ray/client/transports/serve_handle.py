@@ -58,7 +58,9 @@ _WRITE_MS = 1000
 class ClientApi(Protocol):
     """The methods of a replica that clients inside the cluster call.
 
-    `vlagents_ray.serve.replica.replica.PolicyReplica` implements them.
+    `vlagents_ray.serve.replica.replica.PolicyReplica` implements them. An error of this package is
+    returned, as in `vlagents_ray.serve.scaling.sibling_replicas.SiblingApi`: Serve would log it
+    with a traceback.
     """
 
     async def attach(
@@ -79,9 +81,9 @@ class ClientApi(Protocol):
             pause: The last number that the replica returned; 0.0 before the first one.
         """
 
-    async def lease(self, length: int) -> tuple[bytes, int]:
+    async def lease(self, length: int) -> tuple[bytes, int] | VLAgentsError:
         """Lease a plasma channel for frames of `length` bytes; return its id and its capacity,
-        bytes.
+        bytes, or the error.
         """
 
     async def nodes(self) -> dict[str, int]:
@@ -231,12 +233,12 @@ class HandleTransport:
         """Call `ClientApi.lease` of the chosen replica.
 
         Raises:
-            VLAgentsError: The replica raised this error.
+            VLAgentsError: The replica returned this error.
         """
         import ray
 
         try:
-            leased: tuple[bytes, int] = ray.get(
+            leased: tuple[bytes, int] | VLAgentsError = ray.get(
                 call_replica(self._replica, ClientApi.lease, length), timeout=timeout_s
             )
         except ray.exceptions.GetTimeoutError as error:
@@ -244,11 +246,11 @@ class HandleTransport:
                 f"serve://{self._app}: no answer within {timeout_s:g} s"
             ) from error
         except ray.exceptions.RayTaskError as error:
-            if isinstance(error.cause, VLAgentsError):
-                raise error.cause from None
             raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
         except ray.exceptions.RayError as error:
             raise self._lost(error) from error
+        if isinstance(leased, VLAgentsError):
+            raise leased
         return leased
 
     def close(self) -> None:

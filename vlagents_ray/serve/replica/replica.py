@@ -354,15 +354,18 @@ class PolicyReplica(ClientApi, SiblingApi):
         """
         return await answer_frame(self._engine, self._limits, session_id, frame, pause)
 
-    async def lease(self, length: int) -> tuple[bytes, int]:
+    async def lease(self, length: int) -> tuple[bytes, int] | VLAgentsError:
         """Lease a plasma channel for frames of `length` bytes to a client that got the address
-        from `attach`.
+        from `attach`; return its id and its capacity, bytes, or the error.
         """
         if self._plasma is None:
-            raise PolicyUnavailable(
+            return PolicyUnavailable(
                 "plasma: this replica has no plasma endpoint; use transport 'handle'"
             )
-        return await asyncio.to_thread(self._plasma.pool.lease, length)
+        try:
+            return await asyncio.to_thread(self._plasma.pool.lease, length)
+        except VLAgentsError as error:
+            return error
 
     async def nodes(self) -> dict[str, int]:
         """Return the number of replicas that accept sessions on each node, so that clients can be
