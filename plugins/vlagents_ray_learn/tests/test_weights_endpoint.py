@@ -47,6 +47,7 @@ from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.config.parts import PartConfig
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.asgi_websocket import AsgiWebSockets
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.replica.part import PartContext
@@ -243,8 +244,10 @@ def test_a_learner_elsewhere_lets_the_policy_rest_with_the_scope_for_pushes(
     ("change", "error"), [({"revoked": True}, Unauthorized), ({"scopes": []}, Forbidden)]
 )
 def test_a_key_that_loses_its_right_ends_the_push(
-    serving: Serving, change: Any, error: type[Exception]
+    serving: Serving, change: Any, error: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # The periodic check would sometimes close the connection first.
+    monkeypatch.setattr(AsgiWebSockets, "close_overdue", lambda _: None)
     known = ChangingKeys()
     server = serving(keys=known.keys)
     key, values = known.add("learner", scopes=["weights"]), gains(1)
@@ -273,9 +276,11 @@ def test_several_parts_are_on_their_way_at_once_but_none_before_the_header_is_ac
     assert "".join(steps) == "sr" + "sss" + "sr" * 10 + "rrr"
 
 
+@pytest.mark.parametrize("closed", [False, True], ids=["answered", "closed"])
 def test_a_push_that_is_refused_with_parts_on_their_way_says_why(
-    serving: Serving, monkeypatch: pytest.MonkeyPatch
+    serving: Serving, closed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The next part finds out that the key was revoked, or the periodic check does."""
     known = ChangingKeys()
     server = serving(keys=known.keys)
     key, send, sent = known.add("learner", scopes=["weights"]), ProxiedSocket.send, list[int]()
@@ -283,9 +288,16 @@ def test_a_push_that_is_refused_with_parts_on_their_way_says_why(
     def change_before_the_third(self: ProxiedSocket, part: Any, timeout_s: float) -> None:
         sent.append(len(part))
         if len(sent) == 3:
+            if closed:
+                self.recv(30)  # the answer to the first part, which must not find out
             known.change("learner", revoked=True)
+            if closed:
+                with pytest.raises(ConnectionClosed, match="1008"):
+                    self.recv(30)
         send(self, part, timeout_s)
 
+    if not closed:
+        monkeypatch.setattr(AsgiWebSockets, "close_overdue", lambda _: None)
     monkeypatch.setattr(ProxiedSocket, "send", change_before_the_third)
     with pytest.raises(Unauthorized):
         Publisher(server.url, api_key=key).push(gains(1))

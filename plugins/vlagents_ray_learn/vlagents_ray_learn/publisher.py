@@ -16,6 +16,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.base import CodecChoice
@@ -364,6 +365,8 @@ class ServerTarget:
         try:
             answer: dict[str, Any] = json.loads(socket.recv(_PUSH_S))
         except (ConnectionClosed, OSError) as error:
+            if _is_refused(error):
+                self.versions()  # raises the reason
             raise _unknown_outcome(self._url, error) from error
         if "code" in answer:
             raise read_error(answer)
@@ -405,6 +408,17 @@ class ServerTarget:
 def _portable(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values by name, with arrays and tensors converted to numpy arrays."""
     return {name: portable(value) if is_array(value) else value for name, value in values.items()}
+
+
+def _is_refused(error: Exception) -> bool:
+    """Return whether the server closed the connection because of this client, for instance because
+    its key was revoked.
+    """
+    return (
+        isinstance(error, ConnectionClosed)
+        and error.rcvd is not None
+        and error.rcvd.code == CloseCode.POLICY_VIOLATION
+    )
 
 
 def _has_no_part(url: str) -> ConfigError:

@@ -159,6 +159,7 @@ def test_all_are_counted_from_whatever_thread_and_a_fair_sample_is_kept() -> Non
     assert abs(mean - 5_000) < 5 * 10_000 / 12**0.5 / SAMPLE**0.5
 
 
+@pytest.mark.own_process
 def test_a_request_leaves_nothing_to_the_garbage_collector(engine: Engine) -> None:
     """Otherwise garbage collections would pause the policy regularly."""
     engine.start()
