@@ -10,14 +10,11 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from mutants import ROOT, SUBJECTS, Subject, mutants_of
 from needs import left_out
-from schedule import in_order, not_marked_slow, pytest_xdist_make_scheduler
-from xdist.remote import Producer
+from schedule import in_order, not_marked_slow
 
 
 @pytest.mark.parametrize(
@@ -67,50 +64,6 @@ def test_what_runs_alone_is_apart_from_its_file_and_clusters_are_played_by_one_p
     for test, unit in in_order([*beside, *alone]).items():
         together.setdefault(unit, []).append(test)
     assert list(together.values()) == [beside[:2], beside[2:3], beside[3:], alone[:1], alone[1:]]
-
-
-class Process:
-    """A process of pytest-xdist that only keeps what it is given."""
-
-    gateway = SimpleNamespace(id="process")
-    shutting_down = False
-
-    def __init__(self) -> None:
-        self.given: list[int] = []
-
-    def send_runtest_some(self, indices: list[int]) -> None:
-        self.given += indices
-
-    def shutdown(self) -> None:
-        self.shutting_down = True
-
-
-def test_the_last_process_begins_with_the_last_tests_except_those_that_run_alone() -> None:
-    tests = [f"test_{number}.py::{name}" for number in range(6) for name in "xyz"]
-    alone = ["test_0.py::alone", "test_7.py::alone"]
-    config: Any = SimpleNamespace(
-        option=SimpleNamespace(dist="loadfile", loadscopereorder=False),
-        getvalue=lambda _: ["popen"] * 2,
-    )
-    scheduler = pytest_xdist_make_scheduler(config, Producer("", enabled=False))
-    processes = first, last = Process(), Process()
-    for process in processes:
-        scheduler.add_node(process)
-        scheduler.add_node_collection(process, [*tests, *alone])
-    scheduler.schedule()
-    assert [tests[index] for index in first.given] == tests[:3]
-    assert [tests[index] for index in last.given] == tests[-3:]
-
-    # The first process has long tests; the last one does the others.
-    played = 0
-    while played < len(last.given):
-        scheduler.mark_test_complete(last, last.given[played])
-        played += 1
-    units = [index // 3 for index in last.given[::3]]
-    assert units == [5, 4, 3, 2, 1, 6]
-    assert last.given[-2:] == [18, 19]
-    assert last.shutting_down
-    assert not first.shutting_down
 
 
 def test_tests_that_should_be_marked_slow_are_listed_with_the_time_of_all_cases() -> None:

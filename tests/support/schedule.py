@@ -3,9 +3,6 @@
 The slowest units begin first, so that the processes end at about the same time. `seconds.json` has
 the durations of slow files by tier. A run with VLAGENTS_TEST_SECONDS=tests/support/seconds.json
 records its durations there.
-
-The last process begins with the last units. These start no server and seldom wait, so they use the
-cores while the other processes wait for their servers.
 """
 
 from __future__ import annotations
@@ -55,20 +52,6 @@ def in_order(nodeids: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def not_alone(units: Iterable[str]) -> list[str]:
-    """Return the units of `in_order` before the tests that run alone, which are the last tests.
-
-    The first unit of these is the second part of a file: nothing else separates a file.
-    """
-    found: dict[str, str] = {}
-    for label in dict.fromkeys(units):
-        name = label.rpartition(" ")[0]
-        if name in found:
-            break
-        found[name] = label
-    return list(found.values())
-
-
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """With `--dist loadfile`, assign whole units to processes. The tests of a unit that run alone,
@@ -85,15 +68,6 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             if self.units is None:
                 self.units = in_order(self.collection)
             return self.units[nodeid]
-
-        def _assign_work_unit(self, node: Any) -> None:
-            assert self.units is not None
-            if node is self.nodes[-1] and len(self.nodes) > 1:
-                together = set(not_alone(self.units.values()))
-                last = next((one for one in reversed(self.workqueue) if one in together), None)
-                if last is not None:
-                    self.workqueue.move_to_end(last, last=False)
-            super()._assign_work_unit(node)
 
     return UnitScheduling(config, log)
 
