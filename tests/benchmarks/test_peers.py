@@ -199,10 +199,10 @@ def test_a_killed_bench_takes_the_processes_of_a_server_along_that_it_has_stoppe
         assert bench.stdout is not None
         assert bench.stdout.readline() == "stopped\n"
         pids = descendants(bench.pid)
-        stopped = [pid for pid in pids if state(pid) == "T"]
+        assert len(pids) == 4  # also the client, and the helper process of multiprocessing
+        # The server and its child process; a signal takes a moment.
+        wait_for(lambda: sum(state(pid) == "T" for pid in pids) == 2)
         bench.send_signal(signal.SIGKILL)
-    assert len(stopped) == 2  # the server, and its child process
-    assert len(pids) == 4  # also the client, and the helper process of multiprocessing
     wait_for(lambda: all(gone(pid) for pid in pids), 10.0)
 
 

@@ -47,14 +47,11 @@ def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session", autouse=True)
 def importable_agents() -> Iterator[None]:
     """Make `served_agents` importable in this process and in the workers that it starts."""
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = f"{SUPPORT}:{before}" if before else str(SUPPORT)
-    sys.path.append(str(SUPPORT))
-    yield
-    sys.path.remove(str(SUPPORT))
-    os.environ.pop("PYTHONPATH")
-    if before is not None:
-        os.environ["PYTHONPATH"] = before
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(SUPPORT), prepend=os.pathsep)
+        sys.path.append(str(SUPPORT))
+        yield
+        sys.path.remove(str(SUPPORT))
 
 
 @pytest.fixture
