@@ -208,6 +208,13 @@ def levels_of_loggers() -> Iterator[None]:
         logger.setLevel(level)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def frozen_imports() -> Iterator[None]:
+    """Exclude what a file has imported from garbage collection, when its tests are over."""
+    yield
+    freeze_heap()
+
+
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Wait until the test may run, before its duration is measured."""

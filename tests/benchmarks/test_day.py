@@ -13,8 +13,15 @@ MINUTES = 1 / 60
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arms", [1, 2])
-@pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
+@pytest.mark.parametrize(
+    ("relative", "arms"),
+    [
+        pytest.param(False, 1, id="absolute-1"),
+        pytest.param(True, 1, id="relative-1", marks=pytest.mark.integration),
+        pytest.param(False, 2, id="absolute-2", marks=pytest.mark.integration),
+        pytest.param(True, 2, id="relative-2"),
+    ],
+)
 def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop(
     relative: bool, arms: int
 ) -> None:

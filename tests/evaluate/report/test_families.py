@@ -71,7 +71,7 @@ def _equal_policies(number: int, *, sweep: bool, random: np.random.Generator) ->
     [
         pytest.param(6, 15, 780, False, id="all shown"),
         pytest.param(6, 14, 780, True, id="some folded"),
-        pytest.param(18, 15, 153, False, id="all compared"),
+        pytest.param(18, 15, 153, False, id="all compared", marks=pytest.mark.integration),
         pytest.param(18, 15, 152, False, id="the best compared"),
         pytest.param(18, 15, 152, True, id="neighbours compared"),
     ],
