@@ -154,3 +154,55 @@ def test_a_plan_of_chunks_shorter_than_the_ramp_is_executed(
     for _ in range(RUNS):
         rows, _ = executed(random, mode, 0.5, 0.0, delta=delta, chunk=chunk)
         assert rows > at_least
+
+
+class Undecided(Agent):
+    """A policy that plans to stay at one pose at first, and at another pose in later answers."""
+
+    contract = Contract(action=ActionSpec(dim=1, space="joint", delta=False))
+
+    def __init__(self, first: float, later: float, rows: int) -> None:
+        self._first, self._later, self._rows = first, later, rows
+        self.answers = 0
+
+    def act(self, obs: Obs) -> Act:
+        self.answers += 1
+        pose = self._first if self.answers == 1 else self._later
+        return Act(np.full((self._rows, 1), pose, np.float32))
+
+
+def eased_in(policy: Undecided) -> list[float]:
+    """Return the commands until a robot that begins at rest at 0 reaches the pose 0.3, but at most
+    60 commands.
+
+    Each answer arrives within a tick.
+    """
+    guard = Guard(
+        policy.contract,
+        limits=MotionLimits(velocity=SPEED, acceleration=ACCELERATION, jerk=JERK),
+        hz=30.0,
+        measure=lambda obs: obs.state["joints"],
+    )
+    commands: list[float] = []
+    with ChunkPlayer(policy, PlayerSettings("async", deadline_s=30.0), check=guard) as player:
+        player.initialize()
+        obs = Obs(state={"joints": np.zeros(1, np.float32)})
+        player.reset(obs)
+        while len(commands) < 60 and commands[-1:] != [np.float32(0.3)]:
+            while player._caller is not None and player._caller.busy:
+                time.sleep(0)
+            act = player.act(obs)
+            assert SAFE not in act.info
+            commands.append(float(act.action[0]))
+            obs = Obs(state={"joints": act.action})
+    return commands
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_an_ease_in_leads_to_its_plan_whatever_is_answered_meanwhile(rows: int) -> None:
+    policy = Undecided(0.3, -0.3, rows)
+    commands = eased_in(policy)
+    assert policy.answers > 1
+    assert commands == eased_in(Undecided(0.3, 0.3, rows))
+    assert 5 < len(commands) < 60
+    assert commands == sorted(commands)

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 from eval_fakes import LINE, OTHER_LINE
 
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.errors import ConfigError, WeightsLost
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import plan_cases
@@ -287,6 +287,34 @@ def test_an_episode_of_another_checkpoint_or_of_other_weights_is_not_added(
             store.record(replace(done(third), **other), attempts=1)
         store.record(done(third), attempts=1)  # from a server that reports no weights
     assert [one.weights for one in recorded(config())] == [known.get("weights")] * 2 + [None]
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "fingerprint"),
+    [(2, 3, "a"), (3, 4, "a"), (4, 4, "a"), (3, 3, "b"), (None, 3, "a")],
+)
+def test_an_episode_of_other_weights_than_the_pushed_ones_of_its_case_is_not_added(
+    config: Config, first: int | None, last: int, fingerprint: str
+) -> None:
+    settings = config()
+    policy = settings.policies[0].model_dump() | {
+        "pushed_weights": {"version": 3, "fingerprint": "a"}
+    }
+    settings = settings.model_copy(update={"policies": [PolicyConfig.model_validate(policy)]})
+    job, other = planned(settings)[:2]
+    acted = {"first_policy_version": 3, "policy_version": 3, "policy_fingerprint": "a"}
+    mixed = {
+        "first_policy_version": first,
+        "policy_version": last,
+        "policy_fingerprint": fingerprint,
+    }
+    with Store(resolve(settings)) as store:
+        store.begin_run({})
+        store.record(replace(done(job.key), **acted), attempts=1)
+        expected = rf"expected version 3 .* \(a\) .*, got {first} to {last} \({fingerprint}\)"
+        with pytest.raises(WeightsLost, match=expected):
+            store.record(replace(done(other.key), **mixed), attempts=1)
+    assert [one.key for one in recorded(settings)] == [job.key]
 
 
 def test_a_checkpoint_has_the_same_weights_in_all_tasks(config: Config) -> None:

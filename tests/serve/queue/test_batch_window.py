@@ -309,3 +309,16 @@ def test_the_fixed_part_of_a_batch_is_found() -> None:
     for size in (1, 8, 3, 16):
         cost.add(size, fixed(size))
     assert cost.fixed_s() == pytest.approx(0.020)
+
+
+@pytest.mark.parametrize("op", ["reset", "close"])
+def test_a_batch_with_another_operation_than_acts_does_not_count_for_the_durations(op: Op) -> None:
+    returning, _ = answered_together("a", "b")
+    before = returning.describe_costs()
+    assert before is not None
+    returning.record_start([ticket("a", 3.0), ticket("b", 3.0, op=op)])
+    returning.record_end(10.0, 7.0)
+    for _ in range(64):  # the durations are computed again after some batches
+        returning.record_start([ticket("a", 11.0), ticket("b", 11.0)])
+        returning.record_end(11.0, 0.1)
+    assert returning.describe_costs() == before
