@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
-from in_flight import Calls, arrived, ask, send
+from in_flight import Calls, arrived, ask, pending, send
 
 from vlagents_ray.errors import (
     DeadlineExceeded,
@@ -26,14 +26,14 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frames
 from vlagents_ray.protocol.frames import Decoded, decode_replies
-from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
+from vlagents_ray.protocol.messages import BACKGROUND_OPS, MessageLimits, Op, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.observer import Observer
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
+from vlagents_ray.serve.requests import IncomingMessage, Origin, PendingRequest
 
 
 class Gated(Agent):
@@ -404,3 +404,21 @@ def test_no_request_is_executed_of_which_a_deadline_said_that_it_never_will_be(
     engine.close()
     assert said_never == [step == "take"]
     assert policy.executed == ([] if step == "take" else [op])
+
+
+@pytest.mark.parametrize(
+    ("op", "uses_session"),
+    [
+        *[(op, True) for op in ("call", "export", "adopt", "weights")],
+        *[(op, False) for op in ("close", *BACKGROUND_OPS)],
+    ],
+)
+@pytest.mark.parametrize("owner", ["connection", ""])
+def test_only_a_connection_keeps_the_sessions_that_its_requests_use(
+    served: Served, op: Op, uses_session: bool, owner: str
+) -> None:
+    origin = Origin(owner=owner)
+    for session in ("a", "b", "a"):
+        request = pending(session, Request(op), origin=origin)
+        assert served.engine.intake.reserve(request) is None
+    assert set(origin.sessions) == ({"a", "b"} if owner and uses_session else set())
