@@ -26,7 +26,14 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frames
 from vlagents_ray.protocol.frames import Decoded, decode_replies
-from vlagents_ray.protocol.messages import BACKGROUND_OPS, MessageLimits, Op, Reply, Request
+from vlagents_ray.protocol.messages import (
+    BACKGROUND_OPS,
+    INNER_OPS,
+    MessageLimits,
+    Op,
+    Reply,
+    Request,
+)
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.engine.engine import Engine
@@ -422,3 +429,16 @@ def test_only_a_connection_keeps_the_sessions_that_its_requests_use(
         request = pending(session, Request(op), origin=origin)
         assert served.engine.intake.reserve(request) is None
     assert set(origin.sessions) == ({"a", "b"} if owner and uses_session else set())
+
+
+@pytest.mark.parametrize("op", [op for op in INNER_OPS if not op.startswith("gpu_")])
+def test_an_engine_that_is_closed_refuses_each_operation_by_the_same_error(
+    served: Served, op: Op
+) -> None:
+    obs = Obs() if op in ("reset", "act", "prepare") else None
+    request = Request(op, session="first", obs=obs, kwargs={"number": 1} if obs else {})
+    served.engine.close()
+    replies: list[Reply] = []
+    served.engine.intake.submit([pending("first", request, replies.append)])
+    wait_for(lambda: bool(replies))
+    assert isinstance(replies[0].error, PolicyUnavailable)
