@@ -314,7 +314,7 @@ def test_an_episode_of_other_weights_than_the_pushed_ones_of_its_case_is_not_add
         expected = rf"expected version 3 .* \(a\) .*, got {first} to {last} \({fingerprint}\)"
         with pytest.raises(WeightsLost, match=expected):
             store.record(replace(done(other.key), **mixed), attempts=1)
-    assert [one.key for one in recorded(settings)] == [job.key]
+    assert [episode.key for episode in recorded(settings)] == [job.key]
 
 
 def test_a_checkpoint_has_the_same_weights_in_all_tasks(config: Config) -> None:
