@@ -106,9 +106,7 @@ class Telling(Agent):
         if self.notes is not None:
             with Path(self.notes).open("a") as file:
                 file.write(json.dumps(self.told()) + "\n")
-        return self.told() | (
-            {"weights": f"with {kwargs['adapter']}"} if "adapter" in kwargs else {}
-        )
+        return self.told()
 
     def observe(self, obs: Obs) -> None:
         self.seen.append(float(obs.info["value"]))

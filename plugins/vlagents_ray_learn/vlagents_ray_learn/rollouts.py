@@ -676,8 +676,8 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             raise WeightsLost(
                 f"version: {job.key} began when rollouts.version had been set to {episode.pushed}, "
                 f"but its acts name {episode.oldest}; set it to what a push returned, after it has "
-                "(a policy that names none has 0), push again if a replica was restarted since "
-                "then, and choose a pushed adapter in policy_options (acts with the base have 0)"
+                "(a policy that names none has 0), and push again if a replica was restarted "
+                "since then"
             )
 
     def _replay_stale(self) -> None:

@@ -122,9 +122,6 @@ def test_what_was_loaded_there_is_known_here(engine: Engine) -> None:
     told = engine.models.weights
     assert told["digest"]
     assert (ask(engine, "weights", "reset").info or {})["weights"] == told["digest"]
-    assert (ask(engine, "adapted", "reset", kwargs={"adapter": "stack"}).info or {})[
-        "weights"
-    ] == "with stack"
     assert engine.contract.action.dim == 1
 
 

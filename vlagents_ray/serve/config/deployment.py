@@ -7,12 +7,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from vlagents_ray.bounds import MOST_BYTES, MOST_CPUS, MOST_ROWS, MOST_S, MOST_WORKERS
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
-from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.policies.base.program import Program, loaded_code
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.ray_tools.git_state import GitState, code_of
@@ -132,9 +131,7 @@ class CheckpointArgs(_DeploymentModel):
 
     choices: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
-        description="Checkpoints by name: settings that replace those in `config`, or only "
-        "`adapter`, a PEFT folder or hub id (org/name, org/name@COMMIT) of a LoRA "
-        "adapter for the checkpoint in `config`.",
+        description="Checkpoints by name: settings that replace those in `config`.",
     )
     steps: bool = Field(
         default=False,
@@ -147,20 +144,6 @@ class CheckpointArgs(_DeploymentModel):
         le=1_000_000,
         description="Largest number of checkpoints in the memory of one replica.",
     )
-
-    @field_validator("choices")
-    @classmethod
-    def _adapters_stand_alone(cls, choices: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-        for name, settings in choices.items():
-            if ADAPTER in settings and (
-                len(settings) > 1 or not isinstance(settings[ADAPTER], str)
-            ):
-                raise ValueError(
-                    f"{name}: expected {{{ADAPTER}: FOLDER or org/name@COMMIT}} alone, got "
-                    f"{settings}; leave out the other settings, as the adapter is used with those "
-                    "in `config`"
-                )
-        return choices
 
     def of(
         self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]

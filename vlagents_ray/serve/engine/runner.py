@@ -301,7 +301,6 @@ class Runner:
                 for obs in request.history:
                     observes.observe(obs)
 
-        # The info of a session with an adapter already contains the identity.
         info = {**model.identity, **info}
         key = pending.origin.prefix
         plan = RobotPlan()

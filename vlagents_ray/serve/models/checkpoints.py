@@ -4,10 +4,6 @@ load checkpoints.
 A policy's settings contain its checkpoint, and optionally a training step of the checkpoint
 (`checkpoint: /runs/a/{step}`, `checkpoint_step: 20000`). A session chooses among the checkpoints in
 the deployment file; it can never choose a path.
-
-A choice may be a LoRA adapter over the deployment's own checkpoint. All adapters are loaded with
-that checkpoint, as its setting `adapters`, so that sessions with different adapters share a model;
-the adapter is an option of a session's reset.
 """
 
 from __future__ import annotations
@@ -15,14 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, UnknownCheckpoint
+from vlagents_ray.errors import UnknownCheckpoint
 from vlagents_ray.interface import Agent
-from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.policies.base.checkpoint import at_step
 from vlagents_ray.serve.requests import DEFAULT, CheckpointChoice
 
 CHOICE, STEP = "checkpoint", "checkpoint_step"  # options of a reset, and settings of a policy
-_ADAPTERS = "adapters"  # setting of a policy: the adapters by name
 
 
 class Checkpoints:
@@ -50,42 +44,9 @@ class Checkpoints:
         """
         self.make = make
         self.limit = loaded
-        all_choices = choices or {}
-        self._adapters = {
-            name: settings[ADAPTER] for name, settings in all_choices.items() if ADAPTER in settings
-        }
-        self._choices = {
-            name: dict(settings)
-            for name, settings in all_choices.items()
-            if name not in self._adapters
-        }
+        self.config = dict(config or {})
+        self._choices = {name: dict(settings) for name, settings in (choices or {}).items()}
         self._steps = steps
-        self.config = self.with_adapters(config or {})
-
-    def with_adapters(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the deployment's own settings `config` with all adapters that sessions may choose.
-
-        Raises:
-            ConfigError: Two adapters have the same name, or the adapters in `config` are not a
-                mapping.
-        """
-        if not self._adapters:
-            return dict(config)
-        adapters = config.get(_ADAPTERS) or {}
-        if not isinstance(adapters, Mapping):
-            raise ConfigError(
-                f"adapters: expected a folder or a hub id for each name, got {adapters!r}"
-            )
-
-        conflicts = sorted(
-            name for name, source in self._adapters.items() if adapters.get(name, source) != source
-        )
-        if conflicts:
-            raise ConfigError(
-                f"adapters: expected each name once, got {conflicts} both in the policy's "
-                "settings and among the deployment's checkpoints; rename one"
-            )
-        return {**config, _ADAPTERS: {**adapters, **self._adapters}}
 
     def split_options(self, options: Mapping[str, Any]) -> tuple[CheckpointChoice, dict[str, Any]]:
         """Split the options of a reset into the chosen checkpoint and the options for the policy.
@@ -95,20 +56,6 @@ class Checkpoints:
         """
         rest = dict(options)
         choice, step = rest.pop(CHOICE, None), rest.pop(STEP, None)
-        if isinstance(choice, str) and choice in self._adapters:
-            if step is not None:
-                raise UnknownCheckpoint(
-                    f"{STEP}: expected none with the adapter {choice!r}, since an adapter has no "
-                    f"steps, got {step!r}; leave it out"
-                )
-            adapter = rest.get(ADAPTER)
-            if adapter is not None and not (isinstance(adapter, str) and adapter == choice):
-                raise UnknownCheckpoint(
-                    f"{ADAPTER} and {CHOICE}: expected only one of these options, got "
-                    f"{rest[ADAPTER]!r} and {choice!r}; leave one out"
-                )
-            return DEFAULT, {**rest, ADAPTER: choice}
-
         if choice is not None and (not isinstance(choice, str) or choice not in self._choices):
             raise UnknownCheckpoint(f"{CHOICE}: expected {self._choices_text()}, got {choice!r}")
 
@@ -128,9 +75,6 @@ class Checkpoints:
         settings `config`.
         """
         chosen = {} if choice.name is None else self._choices[choice.name]
-        # The adapters are for the deployment's own checkpoint.
-        if self._adapters and choice != DEFAULT:
-            config = {name: value for name, value in config.items() if name != _ADAPTERS}
         return {**config, **chosen, **({} if choice.step is None else {STEP: choice.step})}
 
     def examples(self) -> list[CheckpointChoice]:
@@ -148,7 +92,7 @@ class Checkpoints:
         choices = {
             name: resolved(self.settings(CheckpointChoice(name), config)) for name in self._choices
         }
-        return {"choices": choices | self._adapters, "steps": self._steps, "limit": self.limit}
+        return {"choices": choices, "steps": self._steps, "limit": self.limit}
 
     def offers(
         self, choice: CheckpointChoice, settings: Mapping[str, Any], config: Mapping[str, Any]
@@ -165,7 +109,7 @@ class Checkpoints:
 
     def _choices_text(self) -> str:
         """Return the choices in words, for an error."""
-        names = sorted({*self._choices, *self._adapters})
+        names = sorted(self._choices)
         texts = [f"one of {names}"] if names else []
         texts += [f"a {STEP}"] if self._steps else []
         if not texts:

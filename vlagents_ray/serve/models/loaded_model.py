@@ -20,7 +20,6 @@ from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.act_stream import ActStream, GpuCalls
-from vlagents_ray.policies.adapters import DIGITS
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import identify_weights
 from vlagents_ray.policies.base.program import Program, digest_of, files_named, with_defaults
@@ -40,6 +39,8 @@ logger = logging.getLogger(__name__)
 # Number of acts after which a dummy session is replaced, since its agent may store every
 # observation.
 _LIFE = 1000
+# Number of hexadecimal digits of a checkpoint's digest that are the fingerprint of its weights.
+_FINGERPRINT_DIGITS = 16
 
 
 @dataclass(slots=True)
@@ -390,7 +391,7 @@ class Loader:
         make = (
             agent.model_weights if isinstance(agent, HoldsWeights) else partial(ModelWeights, agent)
         )
-        parameters = make(busy, digest.rpartition(":")[2][:DIGITS], version)
+        parameters = make(busy, digest.rpartition(":")[2][:_FINGERPRINT_DIGITS], version)
         calls = self._calls
         return LoadedModel(
             choice,

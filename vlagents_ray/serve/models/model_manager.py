@@ -340,7 +340,7 @@ class ModelManager:
         """Set the deployment's own settings. The first call sets the initial settings; a later call
         starts a swap.
         """
-        settings = self._source.with_adapters(config)
+        settings = dict(config)
         with self._changed:
             if not self._begun:
                 self._begun, self._cache.config = True, settings
