@@ -23,9 +23,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Out, save
+from benchmarks.console import Out, parse_dims, save
 from vlagents_ray.cli.console import errors
-from vlagents_ray.cli.options import parse_dims
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.base import ModelPolicy
 from vlagents_ray.registry import policy_class

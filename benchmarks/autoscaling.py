@@ -25,6 +25,7 @@ import typer
 
 from benchmarks.console import Out, save
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
+from benchmarks.line_process import LineProcess, ProcessFailed, our_environment
 from benchmarks.picture import OURS, RULE, SERIES, SOFT, new_figure, save_figure
 from benchmarks.robots import RobotBurst
 from vlagents_ray.cli.console import errors, out, progress, table
@@ -36,7 +37,6 @@ from vlagents_ray.serve.config.deployment import POLICY
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi
-from vlagents_ray_cluster.tune.line_process import LineProcess, ProcessFailed, our_environment
 
 _SUFFIXES = (".png", ".svg", ".pdf")
 _SESSIONS, _P95 = SERIES[4], SERIES[1]  # colours of the plot

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from vlagents_ray_cluster.tune.line_process import LineProcess
+from benchmarks.line_process import LineProcess
 
 START_S = 90.0
 CALL_S = 30.0

@@ -46,6 +46,7 @@ import typer
 import vlagents_ray
 from benchmarks.console import Out, save, show_skipped
 from benchmarks.environments import TIMED_ENV, read_episode_times
+from benchmarks.line_process import LineProcess, ProcessFailed, our_environment
 from benchmarks.peers import PYTHON, SCRIPTS, PeersPython, installed
 from benchmarks.report import evaluation_outcomes, show_outcomes
 from vlagents_ray.cli.console import errors, out, progress, table
@@ -55,7 +56,6 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
 from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.serve.ports import LOOPBACK, free_block
-from vlagents_ray_cluster.tune.line_process import LineProcess, ProcessFailed, our_environment
 
 OURS = "vlagents-ray"
 SPLIT = "vlagents, split"  # variant of vlagents with a configuration for each worker

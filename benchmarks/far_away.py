@@ -24,9 +24,9 @@ from benchmarks.far_carrier import Conditions
 from benchmarks.far_link import FarLink
 from benchmarks.far_robot import HZ, MODES
 from benchmarks.hosts import Host, hosts
+from benchmarks.line_process import LineProcess, our_environment
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 PORT = 8000
 _START_S = 180.0

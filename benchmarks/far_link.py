@@ -19,7 +19,7 @@ from dataclasses import asdict
 
 from benchmarks.far_carrier import DEVICE, Conditions
 from benchmarks.hosts import Host
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
+from benchmarks.line_process import LineProcess, our_environment
 
 _MTU = 1500
 # Addresses of RFC 2544 for tests of networks; hosts use the other half of the range.

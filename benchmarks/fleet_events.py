@@ -26,6 +26,7 @@ from benchmarks.figures import measured_on
 from benchmarks.fleet import CURVES
 from benchmarks.fleet_robots import Robot
 from benchmarks.fleet_runs import start_robots
+from benchmarks.line_process import LineProcess
 from benchmarks.processes import program, server_processes
 from benchmarks.push import Trained, TrainedConfig, layers
 from vlagents_ray.cli.console import errors, out, progress, table
@@ -33,7 +34,6 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
-from vlagents_ray_cluster.tune.line_process import LineProcess
 from vlagents_ray_learn import Publisher
 
 _PARAMETERS = 30_000_000  # number of parameters of the pushed model

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.fleet_robots import CONNECT_S, Robot
+from benchmarks.line_process import LineProcess, our_environment
 from benchmarks.processes import cpu_seconds, server_processes
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 SERVED = 0.98  # minimum share of ticks in time of a robot that counts as served
 _AHEAD_S = 0.5

@@ -27,13 +27,13 @@ from benchmarks.autoscaling import check_plot_file
 from benchmarks.console import Out, parse_counts, save
 from benchmarks.drivers import START_S
 from benchmarks.figures import measured_on
+from benchmarks.line_process import LineProcess, our_environment
 from benchmarks.processes import UsageMeter, count_idle, server_processes
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import Server, running_server
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 POLICY = "benchmarks.live:Measured"  # its `reset` returns the process id of the replica
 TRANSPORTS = ("websocket", "http", "shm")  # transports of clients outside of Ray

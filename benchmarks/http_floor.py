@@ -36,6 +36,7 @@ from benchmarks.drivers import START_S, ClientProcess, ProcessDriver
 from benchmarks.figures import measured_on
 from benchmarks.further_tables import replace_rows
 from benchmarks.line_client import obey, timed
+from benchmarks.line_process import LineProcess, our_environment
 from benchmarks.own_clients import OwnClient, observation
 from benchmarks.round_trips import LOOPBACK, StartClient, measure
 from vlagents_ray.cli.console import errors, progress
@@ -46,7 +47,6 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Request
 from vlagents_ray.serve.launch.haproxy import haproxy_binary, ingress_environment
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 BARE = DIRECT, PROXIED = "bare HTTP application", "bare HTTP application behind HAProxy"
 OWN = (OwnClient("http", "jpeg"), OwnClient("websocket", "jpeg"))

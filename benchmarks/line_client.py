@@ -1,5 +1,5 @@
 """The client's side of a benchmark's line protocol, for processes that
-`vlagents_ray_cluster.tune.line_process` starts.
+`benchmarks.line_process` starts.
 
 A client writes one line of JSON when it is connected and warm. Then each line of its input is a
 number of calls to make, which it answers with a JSON list of the calls' durations, ms. It ends when

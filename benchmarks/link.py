@@ -26,13 +26,13 @@ import typer
 from benchmarks import peers as others
 from benchmarks.console import Calls, Out, save, show_round_trips
 from benchmarks.figures import measured_on
+from benchmarks.line_process import LineProcess, our_environment
 from benchmarks.own_clients import OwnClient
 from benchmarks.round_trips import measure
 from vlagents_ray.cli.console import errors, progress
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 RATE = "1gbit"
 PEERS = ("vlagents", "openpi")

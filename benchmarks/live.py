@@ -33,6 +33,7 @@ from websockets.sync.client import connect
 
 from benchmarks.console import Out, save
 from benchmarks.drivers import START_S
+from benchmarks.line_process import LineProcess, our_environment
 from benchmarks.own_clients import observation
 from benchmarks.processes import cpu_seconds
 from vlagents_ray.cli.console import errors, out, progress, table
@@ -45,7 +46,6 @@ from vlagents_ray.serve.engine import sender
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 from vlagents_ray_live.live import LEASE_S
 
 ABSENT, NOBODY, RING = "tap absent", "nobody", "nobody, 30 s held"

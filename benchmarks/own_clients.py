@@ -23,13 +23,13 @@ import numpy as np
 from benchmarks.closed_loop import Call, ClosedLoop
 from benchmarks.drivers import CALL_S, START_S, ClientProcess, ProcessDriver
 from benchmarks.line_client import WARM_UP, obey, timed
+from benchmarks.line_process import our_environment
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.codecs import ImageCodec
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
-from vlagents_ray_cluster.tune.line_process import our_environment
 
 ROBOT, SIMULATION = "robot", "simulation"
 

@@ -10,26 +10,30 @@ kernel. The policy is loaded only once.
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from typing_extensions import Self
 
-from benchmarks.console import Out, Rounds, Seconds, parse_counts, save
+from benchmarks.console import Out, Rounds, Seconds, StateDims, parse_counts, parse_dims, save
 from benchmarks.figures import measured_on
-from benchmarks.network import NetworkTimer, profile
+from benchmarks.measured_policy import (
+    MeasuredPolicy,
+    QueuedTurn,
+    cuda,
+    device_name,
+    forget_peak,
+    peak_mib,
+)
+from benchmarks.network import profile
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import (
     ConfigDir,
     ServeSet,
     Set,
-    StateDims,
     find_policy,
-    parse_dims,
     policy_overrides,
 )
 from vlagents_ray.contract import Contract
@@ -38,15 +42,6 @@ from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.testing import random_observation
-from vlagents_ray_cluster.tune.measured_policy import (
-    WARM,
-    MeasuredPolicy,
-    QueuedTurn,
-    cuda,
-    device_name,
-    forget_peak,
-    peak_mib,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,46 +55,6 @@ class PolicyPlan:
     side: int = 224  # size of images if the policy accepts any size, px
     # Sizes of the parts of the state for which the policy has no size.
     dims: Mapping[str, int] = field(default_factory=dict)
-
-
-class BareAndQueued(MeasuredPolicy):
-    """A policy that is also measured without the queue, and whose network is also
-    measured alone.
-    """
-
-    def __enter__(self) -> Self:
-        self._network = NetworkTimer()
-        with self._network.loading():
-            return super().__enter__()
-
-    def bare(self, size: int, seconds: float) -> dict[str, float]:
-        """Measure `act_batch` with full batches of this size, one after another, without the queue.
-
-        Returns:
-            "actions_per_s"; "batch_ms"; "network_ms": the time of the model's cores, 0 for a policy
-            without cores.
-        """
-        batch = self.batch(range(size))
-        times: list[float] = []
-        networks: list[float] = []
-        while len(times) < WARM + 1 or sum(times[WARM:]) < seconds:
-            begun = time.perf_counter()
-            networks.append(self._network.measure(batch) or 0.0)
-            times.append(time.perf_counter() - begun)
-        times, network_ms = times[WARM:], statistics.median(networks[WARM:])
-        return {
-            "actions_per_s": size * len(times) / sum(times),
-            "batch_ms": statistics.median(times) * 1e3,
-            "network_ms": network_ms,
-        }
-
-    def kernels(self, size: int) -> dict[str, list[dict[str, Any]]]:
-        """Return the longest kernels of each of the model's cores in a call with this batch
-        size.
-        """
-        batch = self.batch(range(size))
-        batch()
-        return self._network.kernels(batch)
 
 
 def measure_policy(
@@ -117,7 +72,7 @@ def measure_policy(
     def view(contract: Contract | None, seed: int) -> Obs:
         return random_observation(contract, seed, image_size=plan.side, dims=plan.dims)
 
-    measured = BareAndQueued(
+    measured = MeasuredPolicy(
         agent,
         view,
         max_size=max(plan.batches),

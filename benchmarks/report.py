@@ -21,6 +21,7 @@ from benchmarks import link
 from benchmarks.console import USE_COLUMNS, Calls, use_cells
 from benchmarks.figures import measured_on
 from benchmarks.further_tables import FurtherTable, read_tables, table_markdown
+from benchmarks.line_process import ProcessFailed
 from benchmarks.peers import PYTHON, PeersPython
 from benchmarks.picture import plot_league, plot_throughput
 from benchmarks.rtt import measure_with_peers
@@ -28,7 +29,6 @@ from benchmarks.throughput import WITHOUT_GAIN, ThroughputPlan, measure_throughp
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-from vlagents_ray_cluster.tune.line_process import ProcessFailed
 
 COMMAND = "python -m benchmarks.report"
 _INTRODUCTION = """# All tables

@@ -35,10 +35,10 @@ from benchmarks.console import Out, parse_counts, save
 from benchmarks.far_carrier import Conditions
 from benchmarks.far_link import FarLink
 from benchmarks.hosts import Host, hosts, ray_cluster
+from benchmarks.line_process import LineProcess, our_environment
 from benchmarks.scaling_driver import Fleet, PlayedEpisodes, ScalingRound
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 # Applications: one replica per worker; one replica per node, with single actions and with chunks.
 OWN, SHARED, CHUNKS = "own", "shared", "chunks"

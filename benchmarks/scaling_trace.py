@@ -22,10 +22,10 @@ from benchmarks.autoscaling import ScaleSample, ScaleWatcher
 from benchmarks.console import Out, save
 from benchmarks.figures import measured_on
 from benchmarks.fleet_robots import CONNECT_S, Robot
+from benchmarks.line_process import LineProcess, our_environment
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import running_server
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 _AHEAD_S = 0.5
 _LATE_S = 60.0

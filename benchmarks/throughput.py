@@ -32,6 +32,8 @@ from benchmarks.closed_loop import Call
 from benchmarks.console import Out, Rounds, Seconds, parse_counts, save, show_skipped
 from benchmarks.drivers import START_S
 from benchmarks.figures import mean_interval, measured_on, median_interval
+from benchmarks.line_process import LineProcess, our_environment
+from benchmarks.measured_policy import rate_of
 from benchmarks.own_clients import (
     LoadGenerator,
     OwnClient,
@@ -45,8 +47,6 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.overrides import parse_settings
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
-from vlagents_ray_cluster.tune.measured_policy import rate_of
 
 DEFAULT_TRANSPORTS = ("plasma", "handle", "shm", "websocket")
 BASE_MS, PER_ITEM_MS = 20.0, 1.0

@@ -7,7 +7,7 @@ import sys
 from typing import Any
 
 from benchmarks.gpu.lab import Lab, view
-from benchmarks.policy import BareAndQueued
+from benchmarks.measured_policy import MeasuredPolicy
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.python_env.child_agent import ChildAgent
@@ -30,7 +30,7 @@ def child(lab: Lab) -> None:
     }
     rows: list[dict[str, Any]] = []
     for place, agent in agents.items():
-        with BareAndQueued(agent, view, max_size=size, patience=0.1) as measured:
+        with MeasuredPolicy(agent, view, max_size=size, patience=0.1) as measured:
             seconds = lab.size(2.0, 0.05)
             bare = measured.bare(size, seconds)
             for sessions in (size, 2 * size):
@@ -63,14 +63,14 @@ def child(lab: Lab) -> None:
     )
 
 
-def _pass_ms(measured: BareAndQueued) -> float | None:
+def _pass_ms(measured: MeasuredPolicy) -> float | None:
     """Return the GPU's time of the last forward pass that the replica reports."""
     engine = measured.engine
     engine.collect_stats()
     return engine.stats.gpu_ms
 
 
-def _memory(measured: BareAndQueued) -> dict[str, float]:
+def _memory(measured: MeasuredPolicy) -> dict[str, float]:
     """Return the memory that the replica reports."""
     memory = measured.engine.models.gpu_memory()
     return {f"{kind}_mib": size / 2**20 for kind, size in memory.items() if kind != "free"}

@@ -58,12 +58,12 @@ def _act_once(config: Mapping[str, Any]) -> dict[str, float]:
     interpreter.
     """
     begun = time.perf_counter()
-    from benchmarks.policy import BareAndQueued
+    from benchmarks.measured_policy import MeasuredPolicy
     from vlagents_ray.policies.wrapper import build_agent
 
     agent = build_agent("pi0", config)
     built = time.perf_counter()
-    with BareAndQueued(agent, view, max_size=config["max_rows"]) as measured:
+    with MeasuredPolicy(agent, view, max_size=config["max_rows"]) as measured:
         loaded = time.perf_counter()
         measured.batch([0])()
         acted = time.perf_counter()

@@ -12,7 +12,7 @@ from benchmarks.fleet_robots import Robot
 from benchmarks.fleet_runs import run_robots, summary
 from benchmarks.gpu.http_server import http_server
 from benchmarks.gpu.lab import Lab
-from benchmarks.policy import BareAndQueued
+from benchmarks.measured_policy import MeasuredPolicy
 from vlagents_ray.serve.fleet import CostCurve, RobotNeed, most_robots
 
 SHORT_ROWS = 8  # number of rows of an answer that robots with short chunks execute
@@ -75,7 +75,7 @@ def _figures(lab: Lab, robot: Robot, count: int) -> dict[str, Any]:
     }
 
 
-def padded_costs(measured: BareAndQueued, sizes: Sequence[int], seconds: float) -> CostCurve:
+def padded_costs(measured: MeasuredPolicy, sizes: Sequence[int], seconds: float) -> CostCurve:
     """Measure the durations of batches of all sizes up to the largest one.
 
     Args:

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from typing_extensions import Self
 
+from benchmarks.measured_policy import MeasuredPolicy
 from benchmarks.photographs import with_photographs
-from benchmarks.policy import BareAndQueued
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Obs
@@ -172,10 +172,10 @@ class Lab:
 
     def measured(
         self, policy: str = "pi0", config: Mapping[str, Any] | None = None, *, largest: int
-    ) -> BareAndQueued:
+    ) -> MeasuredPolicy:
         """Return a policy that is loaded when its context is entered."""
         config = self.settings(max_rows=largest) if config is None else config
-        return BareAndQueued(build_agent(policy, config), view, max_size=largest, patience=0.1)
+        return MeasuredPolicy(build_agent(policy, config), view, max_size=largest, patience=0.1)
 
     @contextlib.contextmanager
     def engine(self, **changed: Any) -> Iterator[Engine]:

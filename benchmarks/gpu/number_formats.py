@@ -8,9 +8,9 @@ from typing import Any, get_args
 import numpy as np
 
 from benchmarks.gpu.lab import Lab, row_error
+from benchmarks.measured_policy import forget_peak, peak_mib
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.policies.compilation import Quantization
-from vlagents_ray_cluster.tune.measured_policy import forget_peak, peak_mib
 
 _COUNT = 8  # number of episodes whose first actions are compared
 _DYNAMIC = "dynamic"  # part of the names of formats that also compute in 8 bits when compiled

@@ -104,11 +104,11 @@ def _serve(pipe: Any, config: dict[str, Any], size: int, environment: Mapping[st
     """Load π0, and answer requests until the pipe is closed; runs in a separate process."""
     die_with_parent()
     os.environ |= environment
-    from benchmarks.policy import BareAndQueued
+    from benchmarks.measured_policy import MeasuredPolicy
     from vlagents_ray.policies.wrapper import build_agent
 
     agent = build_agent("pi0", config)
-    with BareAndQueued(agent, view, max_size=size, patience=0.1) as measured:
+    with MeasuredPolicy(agent, view, max_size=size, patience=0.1) as measured:
         pipe.send("loaded")
         with contextlib.suppress(EOFError):
             while True:

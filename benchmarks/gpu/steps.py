@@ -40,8 +40,8 @@ from benchmarks.gpu.number_formats import number_formats
 from benchmarks.gpu.robots import served
 from benchmarks.gpu.samples import GpuSamples
 from benchmarks.gpu.sharing import sharing
+from benchmarks.measured_policy import MeasuredPolicy, forget_peak, peak_mib
 from benchmarks.network import profile, waits
-from benchmarks.policy import BareAndQueued
 from vlagents_ray.errors import MissingDependency, VLAgentsError
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Agent
 from vlagents_ray.policies.compilation import TOLERANCE
@@ -50,7 +50,6 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.python_env.child_start import die_with_parent
 from vlagents_ray.serve.weights import PushOptions, Rest
-from vlagents_ray_cluster.tune.measured_policy import forget_peak, peak_mib
 
 ROOT = Path(__file__).resolve().parents[2]
 GPU_TESTS = (
@@ -158,7 +157,7 @@ def checkpoint(lab: Lab) -> None:
             )
 
 
-def curve(lab: Lab, measured: BareAndQueued, sizes: Sequence[int]) -> list[dict[str, Any]]:
+def curve(lab: Lab, measured: MeasuredPolicy, sizes: Sequence[int]) -> list[dict[str, Any]]:
     """Measure the network alone, the bare policy and the policy behind its queue, by batch size."""
     rows, seconds = [], lab.size(1.0, 0.02)
     for size in sizes:
@@ -185,7 +184,7 @@ def curve(lab: Lab, measured: BareAndQueued, sizes: Sequence[int]) -> list[dict[
 
 
 def one_act(
-    lab: Lab, measured: BareAndQueued, sizes: Sequence[int], rows: Sequence[Mapping[str, Any]]
+    lab: Lab, measured: MeasuredPolicy, sizes: Sequence[int], rows: Sequence[Mapping[str, Any]]
 ) -> None:
     """Profile one call of each batch size: launches, the busy time and the gaps of the GPU, waits
     for the GPU, and the longest kernels of each core.
@@ -203,7 +202,7 @@ def one_act(
     lab.check("waits of the CPU in an act; one is for the result", sum(places.values()), most=1)
 
 
-def neighbours(lab: Lab, measured: BareAndQueued, size: int) -> float:
+def neighbours(lab: Lab, measured: MeasuredPolicy, size: int) -> float:
     """Compare the actions of one episode: at each place of a full batch with different neighbours,
     and in a batch of its own.
 

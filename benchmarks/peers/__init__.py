@@ -24,12 +24,12 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.drivers import START_S, ClientProcess, ProcessDriver
+from benchmarks.line_process import LineProcess
 from benchmarks.processes import descendants
 from benchmarks.round_trips import LOOPBACK, StartClient
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import requirements_file
 from vlagents_ray.serve.ports import free_port
-from vlagents_ray_cluster.tune.line_process import LineProcess
 
 SCRIPTS = Path(__file__).parent
 REQUIREMENTS = SCRIPTS / "requirements.txt"

@@ -106,6 +106,7 @@ def test_no_command_has_an_option_twice() -> None:
         (report, ["--page", "nowhere/tables.md"], "nowhere"),
         (policy, ["noop", "--batch", "0"], "from 1"),
         (policy, ["noop", "--state-dim", "joints=some"], "joints"),
+        (policy, ["noop", "--state-dim", "joints=1000000000000000000"], "from 1 to 1000000"),
         (policy, ["noop", "--set", "colour=blue"], "colour"),
         (policy, ["nowhere.yaml"], "nowhere.yaml"),
         (rollouts, ["--envs", "15"], "multiples of the 2 workers"),

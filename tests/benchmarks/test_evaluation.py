@@ -23,12 +23,12 @@ from benchmarks.evaluation import (
     ratios,
     their_runs,
 )
+from benchmarks.line_process import ProcessFailed
 from benchmarks.peers import SCRIPTS
 from benchmarks.report import evaluation_outcomes
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.interface import Act
-from vlagents_ray_cluster.tune.line_process import ProcessFailed
 
 FEW = EvaluationPlan(episodes=4, workers=2, size=32, max_steps=3)
 

@@ -23,7 +23,7 @@ from benchmarks.far_carrier import Conditions
 from benchmarks.far_link import FarLink
 from benchmarks.far_robot import HZ, MAX_AGE_S
 from benchmarks.hosts import Host, hosts
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
+from benchmarks.line_process import LineProcess, our_environment
 
 pytestmark = pytest.mark.hosts
 

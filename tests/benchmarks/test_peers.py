@@ -18,6 +18,7 @@ from eval_fakes import wait_for
 from peer_environment import peers_python
 
 from benchmarks import clients
+from benchmarks.line_process import ProcessFailed
 from benchmarks.own_clients import observation, save_observation
 from benchmarks.peers import (
     PEER_CLIENTS,
@@ -34,7 +35,6 @@ from benchmarks.processes import descendants
 from benchmarks.throughput import ThroughputPlan, peer_fleet
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.ports import free_port
-from vlagents_ray_cluster.tune.line_process import ProcessFailed
 
 FAKE = f"""
 import socket, sys

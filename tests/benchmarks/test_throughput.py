@@ -21,10 +21,10 @@ from benchmarks.autoscaling import (
 from benchmarks.bare_policy import BarePolicy
 from benchmarks.closed_loop import ClosedLoop
 from benchmarks.figures import mean_interval
+from benchmarks.measured_policy import rate_of
 from benchmarks.push import measure_push
 from benchmarks.rollouts import LOCAL, OURS, RolloutComparison, compare_rollouts, rollout_outcomes
 from benchmarks.throughput import ThroughputPlan
-from vlagents_ray_cluster.tune.measured_policy import rate_of
 
 
 def test_the_ideal_of_the_default_policy() -> None:

@@ -87,7 +87,6 @@ ROWS = {
     "plan": Row(["plan", "{file}"], FLEET, "models.noop.config."),
     "slurm eval": Row(["slurm", "eval", "{file}"], RUNS, IN_RUNS),
     "slurm serve": Row(["slurm", "serve", "{file}"], DEPLOYMENT),
-    "tune": Row(["tune", "{file}"], DEPLOYMENT),
     "examples/learn/train.py": Row(["{file}"], SETTINGS, command=_typer(train.main)),
     "benchmarks/policy.py": Row(["{file}"], DEPLOYMENT, command=_typer(policy_benchmark.main)),
 }
@@ -199,7 +198,7 @@ def test_a_name_that_is_not_there_is_an_error_with_the_most_similar_one(row: Row
     assert "did you mean 'nightly'?" in done.stderr
 
 
-SERVED = ["serve", "open-loop", "slurm serve", "tune", "benchmarks/policy.py"]
+SERVED = ["serve", "open-loop", "slurm serve", "benchmarks/policy.py"]
 
 
 @pytest.mark.usefixtures("folder")

@@ -316,8 +316,6 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "init: keyword": (["init", "policy", "class"], ["'class'", "module"]),
     "venv create": (["venv", "create", "nothing.txt"], ["nothing.txt", "requirements file"]),
     "venv create: misspelt": (["venv", "create", "lerobt"], ["'lerobt'", "did you mean 'lerobot'"]),
-    "tune: no file": (["tune", "noop"], ["deployment file", ".yaml"]),
-    "tune: absent": (["tune", "nope.yaml"], ["nope.yaml", "does not exist"]),
     "policies: misspelt": (["policies", "opnpi"], ["'opnpi'", "'openpi'"]),
     "report: nothing there": (["report", "nowhere"], ["nowhere", "results"]),
     "report: empty database": (["report", "emptied"], ["results.db", "empty file"]),
@@ -557,7 +555,6 @@ def test_the_light_install_names_all_commands_that_it_lacks() -> None:
         ["robot", "check", "nonsense:Arm"],
         ["plan", "--nonsense"],
         ["slurm", "nonsense"],
-        ["tune", "no-such-policy"],
     ],
     ids=" ".join,
 )

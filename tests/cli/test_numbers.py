@@ -59,7 +59,6 @@ def test_the_numeric_options_are_found() -> None:
     assert {
         ("eval", "--episodes"),
         ("create", "--days"),
-        ("tune", "--minutes"),
         ("serve", "--port"),
     } <= names
     assert len(names) >= 20
@@ -92,7 +91,6 @@ def test_a_number_out_of_its_bounds_is_answered_at_once(
     [
         ["eval", "tabletop", "--policy", "scripted", "--out", "out", "--end-at", "nan"],
         ["eval", "tabletop", "--policy", "scripted", "--out", "out", "--end-at", "1e300"],
-        ["tune", "x.yaml", "--state-dim", "q=1000000000000000000"],
         ["open-loop", "dataset", "--policy", "noop", "--episodes", "0-99999999999999"],
         ["open-loop", "dataset", "--policy", "noop", "--episodes", "9-0"],
         ["eval", "tabletop", "--policy", "noop", "--out", "out", "--live-at", "127.0.0.1:99999"],
@@ -105,9 +103,6 @@ def test_a_number_inside_a_text_has_bounds(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "dataset" / "meta").mkdir(parents=True)
     (tmp_path / "dataset" / "meta" / "info.json").write_text("{}")
-    (tmp_path / "x.yaml").write_text(
-        "applications: [{import_path: 'vlagents_ray.serve.app:build', args: {policy: noop}}]"
-    )
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 2, done.output
     assert words[-2] in done.output

@@ -13,10 +13,10 @@ from eval_fakes import PYTHONPATH
 
 from benchmarks.environments import SLEEPING_ENV
 from benchmarks.hosts import hosts, ray_cluster
+from benchmarks.line_process import LineProcess, our_environment
 from benchmarks.scaling import IMAGE_BYTES, OWN, ScalingPlan, driving, measure_cluster
 from benchmarks.scaling_driver import Fleet, PlayedEpisodes, ScalingRound
 from vlagents_ray.evaluate import Results
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 pytestmark = pytest.mark.hosts
 

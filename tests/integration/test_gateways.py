@@ -21,9 +21,9 @@ from lerobot_messages import AsyncClient, robot_saw
 from peer_environment import package, peers_python
 from virtual_environments import ended
 
+from benchmarks.line_process import LineProcess
 from tests.integration.conftest import SUPPORT, serving
 from vlagents_ray.serve.ports import free_port
-from vlagents_ray_cluster.tune.line_process import LineProcess
 
 ANSWER_S = 120.0  # includes the imports of the client
 

@@ -25,7 +25,6 @@ from vlagents_ray.overrides import (
     Override,
     find_file,
     parse_overrides,
-    parse_settings,
     read_config_file,
     with_overrides,
 )
@@ -92,16 +91,6 @@ LiveAt = Annotated[
         help="Like --live, at this address. An address that other machines reach needs API keys.",
     ),
 ]
-
-StateDims = Annotated[
-    list[str],
-    typer.Option(
-        "--state-dim",
-        metavar="PART=N",
-        help="Number of values in a part of the state, if the policy does not declare it.",
-    ),
-]
-_MOST_DIMS = 1_000_000  # maximum number of values in a part of the state
 _Options = TypeVar("_Options")
 
 
@@ -259,29 +248,6 @@ def changed_settings(source: str | None, overrides: Sequence[Override]) -> dict[
             "them in the file"
         )
     return changed
-
-
-def parse_dims(texts: Iterable[str], option: str) -> dict[str, int]:
-    """Parse the sizes of parts of the state.
-
-    Args:
-        texts: The texts, PART=N.
-        option: The name of the option, for errors.
-
-    Returns:
-        The number of values in each part.
-
-    Raises:
-        ConfigError: A size is not a whole number above 0.
-    """
-    dims = parse_settings(texts, option)
-    for number in dims.values():
-        if type(number) is not int or not 1 <= number <= _MOST_DIMS:
-            raise ConfigError(
-                f"{option}: expected a whole number from 1 to {_MOST_DIMS} for each part, got "
-                f"{dims}"
-            )
-    return dims
 
 
 def parse_list(text: str) -> list[str]:

@@ -1,1 +1,1 @@
-"""Jobs for clusters: evaluations and servers as Slurm jobs, and the tuner of settings."""
+"""Jobs for clusters: evaluations and servers as Slurm jobs."""

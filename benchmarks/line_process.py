@@ -15,7 +15,6 @@ from typing import IO, Any, cast
 
 from typing_extensions import Self
 
-import vlagents_ray
 from vlagents_ray.errors import VLAgentsError
 
 _END_S = 10.0  # time for a process to end, s
@@ -56,7 +55,7 @@ class LineProcess:
         self._end_s = end_s
         self._received = b""  # the bytes after the last complete line of the output
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
-        self._process = subprocess.Popen(  # noqa: S603 - the bench's own scripts
+        self._process = subprocess.Popen(
             list(command),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -154,11 +153,9 @@ class LineProcess:
 
 
 def our_environment() -> dict[str, str]:
-    """Return the environment variables with which a child process can import these packages.
-
-    The child finds this distribution and the core even if they are not installed.
+    """Return the environment variables with which a child process can import the packages of this
+    checkout, even if they are not installed.
     """
-    core = str(Path(vlagents_ray.__file__).parents[1])
-    plugin = str(Path(__file__).parents[2])
+    checkout = str(Path(__file__).parents[1])
     inherited = [folder for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep) if folder]
-    return {"PYTHONPATH": os.pathsep.join(dict.fromkeys([core, plugin, *inherited]))}
+    return {"PYTHONPATH": os.pathsep.join(dict.fromkeys([checkout, *inherited]))}

@@ -1,55 +1,31 @@
-"""A policy in this process, behind a replica's batch queue, with timed calls; without Ray.
-
-`python -m vlagents_ray_cluster.tune.measured_policy` loads and measures one variant of a policy for
-`tuner`. It runs in the policy's Python environment, and therefore needs only the light install and
-pydantic.
-
-The first line of its input is `ProcessSettings`, as JSON. Each further line is a request,
-{"measure": SESSIONS, "seconds": S, "priority": PRIORITY} or {"act": BATCH}. The answer is a line of
-JSON. While the policy loads, lines {"step": …} describe the progress. {"failed": …} is an error.
-"""
+"""A policy in this process, bare or behind a replica's batch queue, with timed calls; no Ray."""
 
 from __future__ import annotations
 
-import json
 import queue
 import resource
+import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from typing_extensions import Self
 
+from benchmarks.network import NetworkTimer
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.policies.wrapper import build_agent, unwrapped
-from vlagents_ray.protocol.frames import decode_requests, encode_requests
-from vlagents_ray.protocol.messages import (
-    DEFAULT_LIMITS,
-    PRIORITIES,
-    Budget,
-    PriorityName,
-    Reply,
-    Request,
-)
+from vlagents_ray.protocol.messages import PRIORITIES, PriorityName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.agent_copies import AgentCopies
-from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
-from vlagents_ray.testing import random_observation
-from vlagents_ray.validation import check_observation
 
 INSTRUCTION = "pick up the cube"
 WARM = 2  # number of warm-up batches, which are not counted
 _LATE_S = 600.0  # time limit of a batch, since the first batch may be compiled
-FRAMES = 8  # number of episodes whose first actions are compared
-_TUNED = ("compile", "dtype", "quantization", "batch_sizes")  # settings of a policy
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +51,10 @@ class _QueuedReplies:
 
 
 class MeasuredPolicy:
-    """A policy behind the batch queue of an engine, loaded from `__enter__` to `__exit__`."""
+    """A policy behind the batch queue of an engine, loaded from `__enter__` to `__exit__`.
+
+    It is also measured without the queue, and the time of its network is also measured alone.
+    """
 
     def __init__(
         self,
@@ -85,21 +64,22 @@ class MeasuredPolicy:
         max_size: int,
         patience: float = 0.0,
         batch_sizes: Sequence[int] = (),
-        on_step: Callable[[str], None] | None = None,
     ) -> None:
         self.agent = agent
         settings = EngineSettings(
             max_batch_size=max_size, patience=patience, batch_sizes=batch_sizes
         )
-        self.engine = Engine(agent, settings, on_step=on_step)
+        self.engine = Engine(agent, settings)
         self.load_s = 0.0
         self._view = view
+        self._network = NetworkTimer()
         self._copies: AgentCopies
 
     def __enter__(self) -> Self:
         began = time.perf_counter()
         try:
-            self.engine.start()
+            with self._network.loading():
+                self.engine.start()
         except BaseException:
             self.engine.close()
             raise
@@ -144,6 +124,35 @@ class MeasuredPolicy:
             return acts
 
         return act
+
+    def bare(self, size: int, seconds: float) -> dict[str, float]:
+        """Measure `act_batch` with full batches of this size, one after another, without the queue.
+
+        Returns:
+            "actions_per_s"; "batch_ms"; "network_ms": the time of the model's cores, 0 for a policy
+            without cores.
+        """
+        batch = self.batch(range(size))
+        times: list[float] = []
+        networks: list[float] = []
+        while len(times) < WARM + 1 or sum(times[WARM:]) < seconds:
+            begun = time.perf_counter()
+            networks.append(self._network.measure(batch) or 0.0)
+            times.append(time.perf_counter() - begun)
+        times, network_ms = times[WARM:], statistics.median(networks[WARM:])
+        return {
+            "actions_per_s": size * len(times) / sum(times),
+            "batch_ms": statistics.median(times) * 1e3,
+            "network_ms": network_ms,
+        }
+
+    def kernels(self, size: int) -> dict[str, list[dict[str, Any]]]:
+        """Return the longest kernels of each of the model's cores in a call with this batch
+        size.
+        """
+        batch = self.batch(range(size))
+        batch()
+        return self._network.kernels(batch)
 
     def queued(self, size: int, seconds: float, priority: PriorityName) -> QueuedTurn:
         """Measure sessions that send their next request as soon as the last request is answered.
@@ -272,133 +281,3 @@ def device_name() -> str:
 
     device = jax_device()
     return "cpu" if device is None else str(device.device_kind)
-
-
-@dataclass(frozen=True, slots=True)
-class ProcessSettings:
-    """The variant to measure; the first line of the process's input."""
-
-    policy: str
-    config: dict[str, Any]
-    wrappers: Sequence[Any]
-    max_size: int  # maximum number of sessions to be measured
-    patience: float  # the deployment's `batch.patience`
-    batch_sizes: Sequence[int]  # the deployment's `batch.sizes`, or none
-    frames: str | None  # a file of `save_observations`; None selects random observations
-    side: int  # size of random images for which the contract defines none, px
-    dims: Mapping[str, int]  # sizes by name in the state, where the contract defines none
-
-
-def save_observations(observations: Sequence[Obs], file: Path) -> None:
-    """Write observations as a frame of requests, for `load_observations`."""
-    file.write_bytes(encode_requests([Request("act", obs) for obs in observations]))
-
-
-def load_observations(file: Path) -> list[Obs]:
-    """Read the observations written by `save_observations`."""
-    data = file.read_bytes()
-    limits = replace(DEFAULT_LIMITS, body_bytes=len(data))
-    requests, error_replies = decode_requests(data, Budget(limits))
-    for reply in error_replies.values():
-        raise PolicyFailed(f"{file}: an observation cannot be sent to a server") from reply.error
-    return [request.obs for request in requests if request.obs is not None]
-
-
-def main() -> None:
-    """Load the policy and answer requests until the input ends."""
-    die_with_parent()
-    out = own_stdout()
-
-    def answer(message: Mapping[str, Any]) -> None:
-        print(json.dumps(message), file=out, flush=True)
-
-    try:
-        _serve(ProcessSettings(**json.loads(sys.stdin.readline())), answer)
-    except Exception as error:  # noqa: BLE001 - a policy may raise any error
-        answer({"failed": _sentence(error)})
-        sys.exit(1)
-
-
-def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None]) -> None:
-    """Load the policy, report it, and answer requests until the input ends."""
-    agent: Agent = build_agent(settings.policy, settings.config, settings.wrappers)
-    recorded = [] if settings.frames is None else load_observations(Path(settings.frames))
-
-    def view(contract: Contract | None, i: int) -> Obs:
-        if not recorded:
-            return random_observation(contract, i, image_size=settings.side, dims=settings.dims)
-        check_observation(recorded[i % len(recorded)], contract)
-        return recorded[i % len(recorded)]
-
-    measured = MeasuredPolicy(
-        agent,
-        view,
-        max_size=settings.max_size,
-        patience=settings.patience,
-        batch_sizes=settings.batch_sizes,
-        on_step=lambda step: answer({"step": step}),
-    )
-    with measured:
-        answer(_report(measured, getattr(unwrapped(agent), "config", None)))
-        for line in sys.stdin:
-            try:
-                result = _result(measured, json.loads(line))
-            except Exception as error:  # noqa: BLE001 - as above; smaller batches may still work
-                result = {"failed": _sentence(error)}
-            answer(result)
-
-
-def _report(measured: MeasuredPolicy, config: Any) -> dict[str, Any]:
-    """Return what the tuner needs to choose variants: the device, the settings and their values.
-
-    Args:
-        measured: The loaded policy.
-        config: The policy's config; None if it has none.
-    """
-    settings = {}
-    for name in _TUNED:
-        if name in getattr(type(config), "model_fields", {}):
-            settings[name] = getattr(config, name)
-
-    # Types that the accelerator computes without emulation, and the values of `compile`.
-    dtypes = [] if jax_device() is None else ["bfloat16"]
-    modes: list[Any] = [False, True]
-    torch_cuda = cuda()
-    if torch_cuda is not None:
-        dtypes = ["bfloat16" if torch_cuda.get_device_capability() >= (8, 0) else "float16"]
-        modes = [False, "graphs", True]
-    return {
-        "device": device_name(),
-        "load_s": measured.load_s,
-        "uncompiled": measured.engine.models.uncompiled,
-        "settings": settings,
-        "dtypes": dtypes,
-        "modes": modes,
-    }
-
-
-def _result(measured: MeasuredPolicy, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the answer to a request of the tuner."""
-    if "act" in request:
-        actions = measured.actions(request["act"], FRAMES)
-        return {"actions": [action.tolist() for action in actions]}
-
-    forget_peak()
-    turn = measured.queued(request["measure"], request["seconds"], request["priority"])
-    return {
-        "actions_per_s": turn.actions_per_s,
-        "trips_ms": [round(trip, 4) for trip in turn.trips_ms],
-        "peak_mib": peak_mib(),
-    }
-
-
-def _sentence(error: BaseException) -> str:
-    """Return an error in one line, with the cause of an error in the policy's code."""
-    cause = error
-    if isinstance(error, PolicyFailed) and error.__cause__ is not None:
-        cause = error.__cause__
-    return f"{type(cause).__name__}: {' '.join(str(cause).split())}"
-
-
-if __name__ == "__main__":
-    main()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vlagents_ray_cluster.tune.line_process import LineProcess, ProcessFailed
+from benchmarks.line_process import LineProcess, ProcessFailed
 
 
 def test_lines_that_come_together_are_heard_one_by_one() -> None:
