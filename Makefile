@@ -32,7 +32,7 @@ SHELL := /bin/bash
 VENV ?= .venv
 TORCH ?= torch==2.13.0
 # Those of plugins/vlagents_ray_NAME that `make setup` installs beside the core.
-PLUGINS ?= arro cluster dialects fleet learn live models results robot sims
+PLUGINS ?= arro cluster dialects learn live models results robot sims
 TORCH_INDEX_URL ?=
 TORCH_CUDA ?=
 PYTHON ?= $(shell for python in python3.11 python3; do \

@@ -12,9 +12,7 @@ and rollouts start and end, `scaling_trace` samples replicas during a burst of r
 `simulated_scaling` computes such traces; `hop` measures a child process behind a replica,
 `adapters` measures sessions with many fine-tunes, `push` new weights while sessions act, `rollouts`
 the transitions of a learner, `fleet` counts the robots that each system serves in time,
-`fleet_events` measures a fleet during failures and pushes, `fleet_simulation` simulates ten
-thousand robots, `fleet_plans` compares the plans of fleets with measurements, and `placement`
-compares how replicas are chosen for robots with large and small needs; `clients` measures clients
-in other languages, `ros` a robot behind topics of ROS 2, `far_away` a robot whose policy is behind
+and `fleet_events` measures a fleet during failures and pushes; `clients` measures clients in other
+languages, `ros` a robot behind topics of ROS 2, `far_away` a robot whose policy is behind
 a long, lossy or cut link.
 """

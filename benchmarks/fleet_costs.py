@@ -1,5 +1,4 @@
-"""Measures the costs that grow with a fleet, each separately and in seconds. `fleet_simulation`
-computes its limits from them.
+"""Measures the costs that grow with a fleet, each separately and in seconds.
 
 `python -m benchmarks.fleet_costs` prints them: a request in the batch queue and in the pace of the
 robots, the reports of robots, the decision of autoscaling in Ray Serve's controller, and HAProxy's

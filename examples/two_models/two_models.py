@@ -7,8 +7,7 @@ real models. In the folder of this file, in two terminals:
     vlagents-ray serve two_models.yaml
     python two_models.py http://localhost:8000
 
-docs/fleet.md explains what happens if a model is late or not available. `vlagents-ray plan
-fleet.yaml` plans the GPUs for twelve such robots.
+docs/fleet.md explains what happens if a model is late or not available.
 """
 
 import sys

@@ -20,7 +20,6 @@ from vlagents_ray.cli import evaluation
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig, Results, replay
 from vlagents_ray.serve.launch import deployment_file
-from vlagents_ray_fleet import plan as fleet_plan
 from vlagents_ray_learn.open_loop import comparison
 
 SETTINGS = {"gain": 1, "nested": {"a": 1, "b": 2}, "entries": [{"x": 1}]}
@@ -37,18 +36,6 @@ DEPLOYMENT = {
 RUNS = {
     "policies": [{"name": "mine", "source": "noop", "config": SETTINGS}],
     "suites": [{"envs": ["tabletop"]}],
-}
-FLEET = {
-    "robots": {"arms": {"count": 1, "hz": 10, "models": {"noop": {"rows": 10}}}},
-    "models": {
-        "noop": {
-            "policy": "noop",
-            "config": SETTINGS,
-            "costs": {"fixed_ms": 10, "row_ms": 1},
-            "memory_gb": 1,
-        }
-    },
-    "gpus": {"count": 1, "memory_gb": 80},
 }
 
 
@@ -84,7 +71,6 @@ ROWS = {
     "eval --policy": Row(["eval", "tabletop", "--out", "out", "--policy", "{file}"], DEPLOYMENT),
     "replay": Row(["replay", "results", "--policy", "{file}"], DEPLOYMENT),
     "open-loop": Row(["open-loop", "dataset", "--policy", "{file}"], DEPLOYMENT),
-    "plan": Row(["plan", "{file}"], FLEET, "models.noop.config."),
     "slurm eval": Row(["slurm", "eval", "{file}"], RUNS, IN_RUNS),
     "slurm serve": Row(["slurm", "serve", "{file}"], DEPLOYMENT),
     "examples/learn/train.py": Row(["{file}"], SETTINGS, command=_typer(train.main)),
@@ -104,9 +90,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def of_runs(config: EvalConfig, *_: Any, **__: Any) -> None:
         raise Captured(config.policies[0].config)
 
-    def of_fleet(fleet: Any) -> None:
-        raise Captured(fleet.models["noop"].config)
-
     def of_training(settings: dict[str, Any]) -> None:
         settings.pop("out", None)
         raise Captured(settings)
@@ -118,7 +101,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(deployment_file, "_require_policy", of_deployment)
     monkeypatch.setattr(evaluation, "run_evaluation", of_runs)
     monkeypatch.setattr("vlagents_ray.cli.policies.resolve_policies", of_runs)
-    monkeypatch.setattr(fleet_plan, "plan", of_fleet)
     monkeypatch.setattr(train.LearnPlan, "model_validate", of_training)
     monkeypatch.setattr(Results, "load", lambda _: None)
     monkeypatch.setattr(replay, "find", lambda *_: Recorded())

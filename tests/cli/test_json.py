@@ -22,8 +22,6 @@ from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.registry import names
 
-ROOT = Path(__file__).parents[2]
-
 
 def offering(command: Any, name: str = "") -> Iterator[str]:
     """Return the names of the commands that have the option."""
@@ -51,7 +49,6 @@ def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyP
         "policies": [],
         "envs": ["tabletop"],
         "doctor": [],
-        "plan": [str(ROOT / "examples/fleet.yaml")],
         "report": [str(out)],
         "verify": [str(tmp_path / "b.zip"), "--replay", "0"],
     }

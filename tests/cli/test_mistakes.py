@@ -553,7 +553,6 @@ def test_the_light_install_names_all_commands_that_it_lacks() -> None:
         ["robot", "nonsense"],
         ["robot", "check"],
         ["robot", "check", "nonsense:Arm"],
-        ["plan", "--nonsense"],
         ["slurm", "nonsense"],
     ],
     ids=" ".join,

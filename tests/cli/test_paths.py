@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
 
-ROOT = Path(__file__).parents[2]
 
 EPISODE = ["--policy", "scripted", "--episodes", "1", "--workers", "0", "--video", "none"]
 # Command and option -> words; "{path}" stands for the path, and "done" for a folder with results.
@@ -59,9 +58,6 @@ COMMANDS: dict[tuple[str, str], list[str]] = {
     ("bundle", "--out"): ["done", "--out", "{path}"],
     ("verify", "bundle"): ["{path}"],
     ("verify", "--out"): ["absent.zip", "--out", "{path}"],
-    ("plan", "file"): ["{path}"],
-    ("plan", "--config-dir"): ["nightly", "--config-dir", "{path}"],
-    ("plan", "--out"): [str(ROOT / "examples/fleet.yaml"), "--out", "{path}"],
     ("venv create", "requirements"): ["{path}"],
     ("venv create", "--out"): ["absent.txt", "--out", "{path}"],
     ("venv create", "--with"): ["r.txt", "--with", "{path}"],

@@ -5,7 +5,7 @@ A robot executes one row of an action chunk at each tick, and needs the next chu
 executed the last row. A request waits for the batch that is running when the request arrives, and
 then for its own batch. Its answer therefore takes the time of two batches and the transport. The
 longer this takes, the fewer rows of the answer are left to execute. The queue, the check of a
-robot's SLO at its reset, autoscaling and the plan of a fleet use this arithmetic.
+robot's SLO at its reset and autoscaling use this arithmetic.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from vlagents_ray.errors import ConfigError
 USABLE = 0.9
 """The largest load at which robots are in time. Requests arrive in bursts, so the queue of a
 replica with a load of 1 grows without bound. In the simulation of six kinds of robots that all
-start within 3 s, at least 98.1 % of a minute's ticks were in time at 0.9, and 91.6 % at 1.0
-(`python -m benchmarks.fleet_plans --loads`).
+start within 3 s, at least 98.1 % of a minute's ticks were in time at 0.9, and 91.6 % at 1.0.
 """
 
 # Share of its longest interval after which a robot replans if the replica has room for that. The
