@@ -61,9 +61,6 @@ class RecordedStep:
     # (H, D): the recorded answer, or else the actions from this frame to the end of the episode.
     expected: np.ndarray
     intervention: bool = False  # whether the operator chose the recorded action
-    captured_at: float | None = None  # s since 1970; None if the dataset does not contain it
-    # JPEG or PNG files of the cameras whose images the dataset contains as files, not as videos.
-    image_files: Mapping[str, bytes] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,10 +190,10 @@ class RecordedDataset:
             name for name, feature in self.features.items() if feature["dtype"] in _IMAGE_DTYPES
         ]
         embedded = [name for name in image_features if self.features[name]["dtype"] == "image"]
-        numeric = (ACTION, STATE, ENVIRONMENT, INTERVENTION_COLUMN, SAFE_COLUMN, CAPTURED)
+        numeric = (ACTION, STATE, ENVIRONMENT, INTERVENTION_COLUMN, SAFE_COLUMN)
         column_names = [name for name in numeric if name in self.features] + embedded
         if self.traced:
-            column_names += [CHUNK, ROWS, "request"]
+            column_names += [CHUNK, ROWS, CAPTURED, "request"]
         columns = self.columns(episode, column_names)
 
         actions = np.array(columns[ACTION], np.float32).reshape(episode.length, -1)
@@ -206,13 +203,12 @@ class RecordedDataset:
 
         for i in range(episode.length):
             images = {}
-            image_files = {}
             for feature, camera in cameras.items():
                 if feature in videos:
                     image = next(videos[feature])
                 else:
-                    image_files[camera] = _embedded_file(columns[feature][i])
-                    image = jpeg_png.decode(image_files[camera], DEFAULT_LIMITS.pixels)
+                    file = _embedded_file(columns[feature][i])
+                    image = jpeg_png.decode(file, DEFAULT_LIMITS.pixels)
                 images[camera] = self._original_size(image, camera)
 
             values = {}
@@ -232,10 +228,7 @@ class RecordedDataset:
             # operator's action.
             rejected = SAFE_COLUMN in columns and bool(columns[SAFE_COLUMN][i])
             obs = Obs(images, gripper, state, info)
-            captured_at = float(columns[CAPTURED][i]) if CAPTURED in columns else None
-            yield RecordedStep(
-                i, obs, expected, intervention and not rejected, captured_at, image_files
-            )
+            yield RecordedStep(i, obs, expected, intervention and not rejected)
 
     def _episodes(self) -> list[RecordedEpisode]:
         """Read the episodes from the metadata, in the order of their indices."""

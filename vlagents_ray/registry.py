@@ -3,10 +3,9 @@ location of their code, and their requirements.
 
 Each name belongs to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add
 entries through the entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`,
-`.robots`, `.leaders`, `.commands`, `.replica`, `.pages`, `.exports`, `.dataset_exports` and
-`.trackers`: an entry point names a `RegistryEntry` in a module that imports nothing large. A
-`"module:Class"` in a deployment file works without registration. Wrappers change the observations
-of any policy, or its actions.
+`.robots`, `.leaders`, `.commands`, `.replica`, `.pages`, `.exports` and `.trackers`: an entry point
+names a `RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a deployment
+file works without registration. Wrappers change the observations of any policy, or its actions.
 
 The tables of README and docs/ are made from these entries: `python tests/support/tables.py`.
 """
@@ -152,8 +151,6 @@ _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "replica": {},  # parts of a replica
     "pages": {},  # web pages that show an evaluation while it runs
     "exports": EXPORTS,
-    # Functions like the exports, but their first argument is the folder of the results.
-    "dataset_exports": {},
     "trackers": {},  # classes like `evaluate.trackers.TrackerRun`
 }
 _SINGULAR = {
@@ -167,7 +164,6 @@ _SINGULAR = {
     "replica": "part of a replica",
     "pages": "page of evaluations",
     "exports": "export format",
-    "dataset_exports": "export format of datasets",
     "trackers": "tracker",
 }
 

@@ -334,6 +334,10 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["no", "create it first"],
     ),
     "bundle: folder": (["bundle", "nowhere", "--out", "no/x.zip"], ["no/x.zip", "create it first"]),
+    "export: a dataset": (
+        ["export", "dataset", "--out", "x.csv", "--to", "csv"],
+        ["expected results of an evaluation, got a LeRobotDataset"],
+    ),
     "export: a folder as the file": (
         ["export", "done", "--to", "csv", "--out", "."],
         ["expected a file", "folder"],

@@ -140,7 +140,6 @@ def registered() -> Iterator[str]:
         "replica",
         "pages",
         "exports",
-        "dataset_exports",
         "trackers",
     )
     for kind in kinds:

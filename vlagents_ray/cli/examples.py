@@ -29,7 +29,6 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "export": (
         "export runs/first --to csv --out episodes.csv",
         "export runs/first --to lerobot --out dataset --set successes=true",
-        "export demos --to mcap --out demos.mcap",
     ),
     "replay": ("replay runs/first 'tabletop#3'", "replay runs/first 'tabletop#3' --policy noop"),
     "policies": ("policies", "policies lerobot"),

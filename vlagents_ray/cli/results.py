@@ -22,7 +22,7 @@ from vlagents_ray.cli.options import (
 )
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.overrides import parse_overrides, parse_settings
-from vlagents_ray.registry import entries, names, registered_function
+from vlagents_ray.registry import entries, registered_function
 from vlagents_ray.settings import wrong_settings
 
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of results.")]
@@ -102,7 +102,7 @@ def _described_formats() -> Iterator[str]:
 def export_command(
     folder: Annotated[
         Path,
-        typer.Argument(metavar="FOLDER", help="Folder of results, or a LeRobotDataset."),
+        typer.Argument(metavar="FOLDER", help="Folder of results."),
     ],
     path: Annotated[
         Path,
@@ -132,35 +132,19 @@ def export_command(
         ),
     ] = [],  # noqa: B006 - typer reads the default
 ) -> None:
-    """Write the episodes of an evaluation in a format for other programs, such as CSV, a
-    LeRobotDataset or MCAP.
-
-    FOLDER may also be a LeRobotDataset, such as the recording of a robot, if the format is MCAP.
+    """Write the episodes of an evaluation in a format for other programs, such as CSV or a
+    LeRobotDataset.
     """
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.artifacts.storage import storing
 
     with errors():
-        if _is_dataset(folder):
-            if policy is not None or env is not None:
-                raise ConfigError(
-                    f"{folder}: expected results of an evaluation with --policy and --env, got a "
-                    "LeRobotDataset; leave the options out"
-                )
-            formats = names("dataset_exports")
-            if to not in formats:
-                raise ConfigError(
-                    f"{folder}: expected a format for a LeRobotDataset, one of {formats}, got "
-                    f"{to!r}; add --to FORMAT"
-                )
-            recorded: Path | Results = folder
-            export = registered_function("dataset_exports", to)
-        else:
-            export = registered_function("exports", to)
-            recorded = Results.load(folder).only(policy, env)
+        _require_no_dataset(folder)
+        export = registered_function("exports", to)
+        results = Results.load(folder).only(policy, env)
         parsed = settings_of_export(to, export, settings)
         with storing(path.parent):
-            number = export(recorded, path, **parsed)
+            number = export(results, path, **parsed)
     out.print(f"wrote {number} episodes to {path}")
 
 
@@ -197,16 +181,11 @@ def settings_of_export(
     return {field: getattr(parsed, field) for field in parsed.model_fields_set}
 
 
-def _is_dataset(folder: Path) -> bool:
-    """Return whether a folder is a LeRobotDataset, or contains LeRobotDatasets."""
-    return any(folder.glob("meta/info.json")) or any(folder.glob("*/meta/info.json"))
-
-
 def _require_no_dataset(folder: Path) -> None:
     """Raise `ConfigError` if a folder is or contains LeRobotDatasets, which only `open-loop`
     reads.
     """
-    if _is_dataset(folder):
+    if any(folder.glob("meta/info.json")) or any(folder.glob("*/meta/info.json")):
         raise ConfigError(
             f"{folder}: expected results of an evaluation, got a LeRobotDataset; run "
             f"`vlagents-ray open-loop {folder} --policy NAME` to compare a policy with it"

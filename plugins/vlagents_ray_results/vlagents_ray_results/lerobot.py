@@ -50,7 +50,6 @@ from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results
 from vlagents_ray.images.mp4 import rgb_converter
 from vlagents_ray.naming import did_you_mean, distinct
 from vlagents_ray.registry import require
-from vlagents_ray_results.recorded import recorded_episodes
 
 GRIPPER_FEATURE = "observation.gripper"
 VERSION = "policy_version"
@@ -94,7 +93,7 @@ def to_lerobot(
         ConfigError: There is no such trajectory, a file is missing, a camera or part is unknown, or
             the episodes do not fit one dataset.
     """
-    recorded = recorded_episodes(results)
+    recorded = _recorded_episodes(results)
 
     if successes:
         solved = [(case, episode) for case, episode in recorded if episode.result.success_once]
@@ -143,6 +142,23 @@ def to_lerobot(
 
         shutil.rmtree(root / UNFINISHED_FOLDER, ignore_errors=True)
         return dataset.episodes
+
+
+def _recorded_episodes(results: Results) -> list[tuple[CaseResults, Episode]]:
+    """Return each episode that has a trajectory, with its case.
+
+    Raises:
+        ConfigError: No episode has a trajectory.
+    """
+    recorded = []
+    for case in results.cases:
+        recorded += [(case, episode) for episode in case.episodes if episode.trajectory is not None]
+    if not recorded:
+        raise ConfigError(
+            f"{results.out}: expected trajectories, got none; evaluate with --record all "
+            "(`record: all` in its file)"
+        )
+    return recorded
 
 
 _CURE = "export env by env (--env)"

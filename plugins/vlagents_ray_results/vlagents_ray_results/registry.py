@@ -28,19 +28,6 @@ LEROBOT = RegistryEntry(
     "vlagents_ray_results.lerobot:to_lerobot",
     "a LeRobotDataset v3.0 of the observations and actions, in a new folder",
 )
-MCAP = RegistryEntry(
-    "vlagents_ray_results.mcap_file:results_to_mcap",
-    "one MCAP file of the observations and actions, for Foxglove",
-    needs=("mcap",),
-    extra="mcap",
-)
-MCAP_OF_DATASET = RegistryEntry(
-    "vlagents_ray_results.mcap_file:dataset_to_mcap",
-    "one MCAP file, for Foxglove",
-    needs=("mcap",),
-    extra="mcap",
-)
-
 WANDB = RegistryEntry(
     "vlagents_ray_results.trackers:WandbRun", "Weights & Biases", needs=("wandb",), extra="wandb"
 )
