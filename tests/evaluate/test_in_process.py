@@ -117,6 +117,23 @@ def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_vi
     assert "state 'position' differs" in warnings[0]
 
 
+def test_a_second_evaluation_of_a_process_reads_the_state_of_its_code_from_memory(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = evaluate(config(workers=0, out=tmp_path / "first"), agent_factory=ToZero)
+    commands = []
+    start = subprocess.Popen.__init__
+
+    def noted(self: Any, args: Any, *rest: Any, **options: Any) -> None:
+        commands.append(args)
+        start(self, args, *rest, **options)
+
+    monkeypatch.setattr(subprocess.Popen, "__init__", noted)
+    second = evaluate(config(workers=0, out=tmp_path / "second"), agent_factory=ToZero)
+    assert commands == []
+    assert second.results.runs[0].versions == first.results.runs[0].versions
+
+
 def test_it_goes_on_with_what_has_no_result(config: Config) -> None:
     evaluate(config(workers=0), agent_factory=ToZero, only=(2, 2))
     with pytest.raises(ConfigError, match="already has results"):

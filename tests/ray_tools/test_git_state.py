@@ -26,7 +26,8 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     git(folder, "add", ".")
     git(folder, "commit", "--quiet", "--message", "begin")
     monkeypatch.syspath_prepend(str(folder))
-    git_state._code.cache_clear()
+    for cached in (code_in, git_state._is_tracked, git_state._code):
+        cached.cache_clear()
     return folder
 
 

@@ -34,9 +34,12 @@ class GitState:
         }
 
 
+@functools.cache
 def code_in(folder: Path) -> GitState | None:
     """Return the state of the repository that contains a folder; None if there is none, or git
     is not installed.
+
+    It is the state at the first call, since later edits do not change the running code.
     """
     top = _git(folder, "rev-parse", "--show-toplevel")
     return None if top is None else _code(top.decode().rstrip("\n"))
@@ -58,14 +61,18 @@ def code_of(target: str) -> GitState | None:
     file = Path(spec.origin)
     # An installed package may be in a virtual environment within a repository that does not track
     # it.
-    if _git(file.parent, "ls-files", "--error-unmatch", "--", file.name) is None:
-        return None
-    return code_in(file.parent)
+    return code_in(file.parent) if _is_tracked(file) else None
+
+
+@functools.cache
+def _is_tracked(file: Path) -> bool:
+    """Return whether git tracks a file, at the first call."""
+    return _git(file.parent, "ls-files", "--error-unmatch", "--", file.name) is not None
 
 
 @functools.cache
 def _code(top: str) -> GitState | None:
-    """Return the state at the first call, since later edits do not change the running code."""
+    """Return the state of the repository with this top folder, at the first call."""
     commit = _git(Path(top), "rev-parse", "--verify", "HEAD")
     diff = _git(Path(top), "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD")
     if commit is None or diff is None:
