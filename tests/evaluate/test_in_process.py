@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from eval_fakes import DRIFTING_LINE, LINE, OTHER_LINE, ToZero
+from eval_fakes import LINE, OTHER_LINE, ToZero
 from in_process_evaluation import flat_config
 
 from vlagents_ray import Act, Obs
@@ -86,35 +86,6 @@ def test_a_short_evaluation_that_needs_no_ray_has_no_workers(
 def test_a_process_in_a_cluster_plays_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "10.0.0.1:6379")
     assert resolved.resolve(flat_config(envs=[LINE], out="out")).workers == 1
-
-
-def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_video_and_a_warning(
-    config: Config, caplog: pytest.LogCaptureFixture
-) -> None:
-    settings = config(
-        envs=[DRIFTING_LINE],
-        env_options={"camera": [32, 32]},
-        episodes=12,
-        video="failures",
-        workers=0,
-    )
-    summary = evaluate(settings, agent_factory=lambda: ToZero(3))
-    failed = [
-        one
-        for case in summary.results.cases
-        for one in case.episodes
-        if not one.result.success_once
-    ]
-    bare = [str(one.result.key) for one in failed if not one.videos]
-    warnings = [
-        record.getMessage()
-        for record in caplog.records
-        if "its video is not recorded" in record.getMessage()
-    ]
-    assert len(bare) == len(warnings) == 1
-    assert len(failed) > 1
-    assert warnings[0].startswith(f"{bare[0]}: ")
-    assert "state 'position' differs" in warnings[0]
 
 
 def test_a_second_evaluation_of_a_process_reads_the_state_of_its_code_from_memory(

@@ -56,7 +56,7 @@ def info(root: Path) -> dict:
 
 
 def test_two_cameras_never_share_a_video(tmp_path: Path) -> None:
-    for _ in range(2):  # the second pass opens the dataset again
+    for _ in range(2):  # the second round opens the dataset again
         with Recorder(tmp_path, FPS) as recorder, recorder.episode("look"):
             for i in range(4):
                 views = {"left/wrist": 0, "left_wrist": 200, "front": 100}
@@ -78,7 +78,7 @@ def test_two_cameras_never_share_a_video(tmp_path: Path) -> None:
 def test_a_policy_that_is_trained_on_it_learns_what_its_state_and_cameras_are(
     tmp_path: Path,
 ) -> None:
-    for _ in range(2):  # the second pass opens the dataset again
+    for _ in range(2):  # the second round opens the dataset again
         record(tmp_path, 3)
     about = DatasetContract.from_json(info(tmp_path)[INFO])
     assert about.state == ("joints", "left/force", "gripper")

@@ -22,7 +22,6 @@ from vlagents_ray.interface import Act, Agent, Obs
 LINE = "eval_fakes:Line"
 OTHER_LINE = "eval_fakes:OtherLine"
 SPARING_LINE = "eval_fakes:SparingLine"
-DRIFTING_LINE = "eval_fakes:DriftingLine"
 CLINGING = "eval_fakes:Clinging"
 EVERY = -1  # `lost_on` for all seeds
 HURRY = "VLAGENTS_RAY_TEST_HURRY"  # variable, see `Unhurried`
@@ -163,22 +162,6 @@ class SparingLine(Line):
             return replace(obs, cameras={})
         SparingLine.rendered += len(obs.cameras)
         return obs
-
-
-class DriftingLine(SparingLine):
-    """An environment whose episodes all begin in different states."""
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        self._resets = 0
-
-    def reset(
-        self, *, seed: int, options: Mapping[str, Any] | None = None
-    ) -> tuple[Obs, dict[str, Any]]:
-        obs, info = super().reset(seed=seed, options=options)
-        self._resets += 1
-        self._position += 0.01 * self._resets
-        return replace(obs, state={"position": np.array([self._position], np.float32)}), info
 
 
 class ToZero(Agent):

@@ -342,14 +342,6 @@ class _Run(Consumer):
         """Write the files and the result of an episode, and stop the case if its outcomes
         suffice.
         """
-        if artifacts.not_repeatable is not None:
-            log.warning(
-                "%s: its video is not recorded, as its actions do not repeat it in the "
-                "simulator: %s; its worker renders further episodes while they run",
-                job.key,
-                artifacts.not_repeatable,
-            )
-
         # Write the files before the result. After a crash in between, the episode is repeated and
         # overwrites the files.
         videos, trajectory = save(self._plan.out, job.case, result, artifacts)

@@ -111,7 +111,7 @@ def test_episodes_side_by_side_have_the_transitions_of_each_by_itself() -> None:
     for key, recorder, result in zip(keys, recorders, results, strict=True):
         assert isinstance(result, EpisodeResult)
         alone, _ = transitions(Stating(stated={"value": 1.0}), key=key, want=["value"])
-        assert recorder.finish(result, lambda *_: None).transitions.equals(alone)
+        assert recorder.finish(result).transitions.equals(alone)
 
 
 def test_images_have_a_column_of_their_own_which_may_be_left_out() -> None:

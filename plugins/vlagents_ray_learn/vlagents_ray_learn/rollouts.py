@@ -20,8 +20,7 @@ from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder
 from vlagents_ray.evaluate.driver import Consumer, Driver
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, version_of
-from vlagents_ray.evaluate.episode.second_pass import SecondPass
-from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
+from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.workers.base import Workers
@@ -62,8 +61,8 @@ class TransitionRecorder(EpisodeRecorder):
         self._next_replay: dict[str, np.ndarray] = {}
 
     @property
-    def wants_images(self) -> EpisodeChoice:
-        return "all" if self._images else "none"
+    def needs_images(self) -> bool:
+        return self._images
 
     def add_observation(self, obs: Obs) -> None:
         """Add the observation before an action, or after the last action.
@@ -152,7 +151,7 @@ class TransitionRecorder(EpisodeRecorder):
             raise ConfigError(f"{field}: expected {expected} as in the first act, got {shapes}")
         return values
 
-    def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
+    def finish(self, result: EpisodeResult) -> Artifacts:
         """Return the transitions of the episode; None if an error of the policy ended it."""
         if result.status != "done":
             return Artifacts()

@@ -24,22 +24,19 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vlagents_ray.envs.base import make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.artifacts.recorder import NO_VERSION, Trajectory
-from vlagents_ray.evaluate.episode.failures import env_side
-from vlagents_ray.evaluate.episode.records import Ending, EpisodeObserver, EpisodeResult, Status
-from vlagents_ray.evaluate.episode.second_pass import play_actions
+from vlagents_ray.evaluate.episode.records import Ending, EpisodeResult, Status
 from vlagents_ray.evaluate.plan.config import fingerprint
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
 from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results, reading, table
 from vlagents_ray.evaluate.results.summary import summarize, write_summary
-from vlagents_ray.interface import Obs
 from vlagents_ray.registry import env_suite, names
 from vlagents_ray_results.bundle import MANIFEST, MOST_BYTES, require_file, unpack
+from vlagents_ray_results.recorded_actions import replay_actions
 
 Verdict = Literal["equal", "differs", "other here", "not checked"]
 MOST_TRAJECTORY = 2**30  # maximum size of a trajectory, unpacked, bytes
@@ -546,92 +543,6 @@ _CODE = re.compile("trust.*|module|source_dir")
 _WORD = re.compile(r"\w[\w.+-]{0,63}")  # a text value that is not a path, URL or "module:Class"
 
 
-@dataclass(frozen=True, slots=True)
-class Replayed:
-    """The result of executing recorded actions in an environment here, compared with the recording
-    step by step.
-    """
-
-    success: list[bool]  # success after each step
-    ending: Ending
-    instruction: str  # the instructions; several are joined with semicolons
-    # The largest difference of a number, for each step that differs; step 0 is the reset.
-    differences: dict[int, float]
-    described: Mapping[str, Any]  # the description of the environment here
-
-
-class _Comparison(EpisodeObserver):
-    """Compares an episode with its recording, step by step."""
-
-    def __init__(self, recorded: Trajectory) -> None:
-        self.success: list[bool] = []  # success after each step
-        # The largest difference of a number, for each step that differs; step 0 is the reset.
-        self.differences: dict[int, float] = {}
-        self._recorded = recorded
-        self._obs: Obs | None = None  # the newest observation
-
-    def add_observation(self, obs: Obs) -> None:
-        """Compare the observation of the reset; the observation of a step is compared together with
-        the step's outcome.
-        """
-        if self._obs is None:
-            self._note(0, _difference(self._recorded, 0, obs, None))
-        self._obs = obs
-
-    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Compare a step: its observation and its outcome."""
-        self.success.append(success)
-        number = len(self.success)
-        if self._obs is not None:
-            outcome = (reward, success)
-            self._note(number, _difference(self._recorded, number, self._obs, outcome))
-
-    def _note(self, number: int, difference: float | None) -> None:
-        if difference is not None:
-            self.differences[number] = difference
-
-
-def _difference(
-    recorded: Trajectory, number: int, obs: Obs, outcome: tuple[float, bool] | None
-) -> float | None:
-    """Return the largest difference of the numbers of a step or the reset; None if they are
-    bit-identical.
-
-    The difference is infinite if names or shapes differ, and 0 if only the success differs.
-
-    Args:
-        recorded: The recording.
-        number: The number of steps so far; 0 for the reset.
-        obs: The observation after these steps.
-        outcome: Reward and success of the last step; None for the reset.
-    """
-    if obs.state.keys() != recorded.state.keys():
-        return float("inf")
-    if (obs.gripper is None) != (recorded.gripper is None):
-        return float("inf")
-
-    pairs = []
-    for name, values in obs.state.items():
-        pairs.append((recorded.state[name][number], np.asarray(values, np.float32)))
-    if recorded.gripper is not None:
-        pairs.append((recorded.gripper[number], np.asarray(obs.gripper, np.float32)))
-    if outcome is not None:
-        pairs.append((recorded.rewards[number - 1], np.asarray(outcome[0], np.float64)))
-
-    differences = []
-    for recorded_values, replayed_values in pairs:
-        if recorded_values.shape != replayed_values.shape:
-            differences.append(float("inf"))
-        elif recorded_values.tobytes() != replayed_values.tobytes():
-            change = np.asarray(replayed_values, np.float64) - np.asarray(
-                recorded_values, np.float64
-            )
-            differences.append(float(np.max(np.abs(change))))
-    if outcome is not None and bool(recorded.success[number - 1]) != outcome[1]:
-        differences.append(0.0)
-    return max(differences, default=None)
-
-
 def require_harmless(case: CaseResults) -> None:
     """Raise `ConfigError` if creating this environment could run other code than that of a
     registered environment.
@@ -654,45 +565,6 @@ def require_harmless(case: CaseResults) -> None:
                 f"{case.env}: expected {kind} that cannot name files or code, got {risky}; give "
                 "--trust if you trust their author"
             )
-
-
-def replay_actions(case: CaseResults, episode: Episode, trajectory: Trajectory) -> Replayed:
-    """Execute the actions of `trajectory` in the environment of `case`, beginning with the
-    episode's seed.
-
-    State, gripper, rewards and success are compared bit by bit; images are neither rendered nor
-    compared.
-
-    Raises:
-        ConfigError: The environment rejects these options, or is unknown here; also
-            `MissingDependency`.
-        EnvFailed: The simulator failed.
-    """
-    key = episode.result.key
-    with env_side("make"):
-        env = make_batch(case.env, 1, **(case.settings.get("env_options") or {}))
-    try:
-        comparison = _Comparison(trajectory)
-        result = play_actions(
-            env,
-            key,
-            list(trajectory.actions),
-            comparison,
-            reset_options=case.settings.get("reset_options"),
-            images="none",
-        )
-        with env_side("describe"):
-            described = env.describe()
-        return Replayed(
-            comparison.success,
-            result.ending,
-            result.instruction,
-            comparison.differences,
-            described,
-        )
-    finally:
-        with env_side("close"):
-            env.close()
 
 
 def _is_plain(value: object) -> bool:

@@ -28,7 +28,6 @@ from vlagents_ray.evaluate.artifacts.recorder import (
     videos_of,
 )
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
@@ -142,11 +141,10 @@ def test_nothing_is_encoded_or_collected_unless_it_is_asked_for(
 
     monkeypatch.setattr(VideoRecorder, "add_observation", fail)
     monkeypatch.setattr(TrajectoryRecorder, "add_observation", fail)
-    monkeypatch.setattr(PlayedEpisode, "add_observation", fail)
     with closing(Recording("none", "none", 10.0)) as recording:
         recording.add_observation(Obs(state={"position": np.zeros(1, np.float32)}))
         recording.add_action(np.zeros(1, np.float32), 0.0, False)
-        assert recording.wants_images == "none"
+        assert not recording.needs_images
 
 
 def test_an_observation_that_lacks_a_part_of_the_state_is_the_simulators_failure() -> None:
@@ -311,7 +309,7 @@ def test_exact_images_of_a_trajectory_are_those_that_the_policy_got(
                 assert opened.streams.video[0].codec_context.pix_fmt == "yuv420p"
 
 
-def test_failures_that_are_recorded_exactly_get_their_images_in_the_second_pass(
+def test_failures_that_are_recorded_exactly_have_the_image_of_every_step(
     config: Config,
 ) -> None:
     settings = {"episodes": 12, "record": "failures", "video": "none", "env_options": CAMERA}

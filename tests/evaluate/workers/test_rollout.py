@@ -22,6 +22,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
+from vlagents_ray.evaluate.artifacts.recorder import Artifacts
 from vlagents_ray.evaluate.episode.failures import explain
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
@@ -143,42 +144,29 @@ def rendered(
 
 
 @pytest.mark.parametrize("kept", ["video", "record"])
-def test_only_failed_episodes_are_rendered_wholly_and_show_what_a_video_of_all_shows(
+def test_every_frame_is_rendered_as_it_is_played_and_only_failures_are_kept(
     config: Config, kept: str
 ) -> None:
-    """The policy uses observations 1, 4, 7 and 10 of 11. A failed episode is run again to render
-    all of them.
-    """
+    """The policy uses observations 1, 4, 7 and 10 of 11, and a recording uses all of them."""
     seeds = seeds_by_outcome(config, chunk=3)
     solved, failed = seeds[True][0], seeds[False][0]
-    few, [first, second] = rendered(
+    unrecorded, _ = rendered(rollout_of(config, lambda: ToZero(3)), solved, failed)
+    of_failures, [first, second] = rendered(
         rollout_of(config, lambda: ToZero(3), **{kept: "failures"}), solved, failed
     )
-    every, [_, shown] = rendered(
+    of_all, [_, shown] = rendered(
         rollout_of(config, lambda: ToZero(3), **{kept: "all"}), solved, failed
     )
-    assert few == [4, 4 + 11]
-    assert every == [11, 11]
-    assert (first.artifacts.videos, first.artifacts.policy_videos, first.artifacts.trajectory) == (
-        {},
-        {},
-        None,
-    )
+    assert unrecorded == [4, 4]
+    assert of_failures == of_all == [11, 11]
+    assert first.artifacts == Artifacts()
     assert second.artifacts == shown.artifacts
     assert second.result is not None
     assert shown.result is not None
     assert second.result.outcome == shown.result.outcome
 
 
-def test_a_worker_whose_episodes_mostly_fail_renders_them_as_it_plays(config: Config) -> None:
-    seeds = seeds_by_outcome(config, chunk=3)
-    worker = rollout_of(config, lambda: ToZero(3), video="failures")
-    images, reports = rendered(worker, *seeds[False][:2], seeds[True][0], seeds[True][1])
-    assert images == [4 + 11, 11, 11, 11]
-    assert [bool(report.artifacts.videos) for report in reports] == [True, True, False, False]
-
-
-def test_episodes_side_by_side_are_rendered_again_one_by_one(config: Config) -> None:
+def test_failures_of_episodes_side_by_side_are_kept(config: Config) -> None:
     class Sessions(ToZero):
         def sessions(self, n: int) -> list[ToZero]:
             return [ToZero(3) for _ in range(n)]

@@ -21,7 +21,6 @@ import numpy as np
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidObservation
 from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult, version_of
-from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode, SecondPass
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, RecordedImages
 from vlagents_ray.images.mp4 import Mp4
@@ -285,24 +284,18 @@ class Artifacts:
     policy_videos: dict[str, bytes] = field(default_factory=dict)
     trajectory: bytes | None = None  # a `Trajectory` as an .npz file
     transitions: Any = None  # a pyarrow.RecordBatch, for a learner
-    not_repeatable: str | None = None  # reason why the second pass rendered no images
 
 
 class EpisodeRecorder(EpisodeObserver):
     """The interface of a recorder for one episode. This class itself records nothing."""
 
     @property
-    def wants_images(self) -> EpisodeChoice:
-        """The choice of episodes for which the recorder needs the images of every step."""
-        return "none"
+    def needs_images(self) -> bool:
+        """Whether the recorder needs the images of every step."""
+        return False
 
-    def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
-        """Return the artifacts of the episode.
-
-        Args:
-            result: The result of the episode.
-            second_pass: Renders images that were not rendered during the episode.
-        """
+    def finish(self, result: EpisodeResult) -> Artifacts:
+        """Return the artifacts of the episode, which has this result."""
         return Artifacts()
 
     def close(self) -> None:
@@ -313,7 +306,11 @@ RecorderFactory = Callable[[float | None], EpisodeRecorder]  # the argument is t
 
 
 class Recording(EpisodeRecorder):
-    """Records a video and a trajectory of one episode, if the settings choose the episode."""
+    """Records a video and a trajectory of one episode, if the settings may choose the episode.
+
+    An episode that may fail is recorded until it ends. If it does not fail, the recording is
+    discarded.
+    """
 
     def __init__(
         self,
@@ -343,25 +340,17 @@ class Recording(EpisodeRecorder):
             if video != "none":
                 self._recorded_videos.append(self._video)
         self._trajectory = TrajectoryRecorder()
-        self._played = PlayedEpisode()
 
         self._observers: list[EpisodeObserver] = []
-        if self.wants_images != "none":
+        if self.needs_images:
             self._observers += self._recorded_videos
-        if self.wants_images == "failures":
-            self._observers.append(self._played)
         if self._wants_trajectory != "none":
             self._observers.append(self._trajectory)
 
     @property
-    def wants_images(self) -> EpisodeChoice:
-        """The choice of episodes for which the images of every step are needed, for a video or a
-        trajectory.
-        """
-        choices = (self._wants_video, self._wants_trajectory)
-        if "all" in choices:
-            return "all"
-        return "failures" if "failures" in choices else "none"
+    def needs_images(self) -> bool:
+        """Whether a video or a trajectory may need the images of every step."""
+        return self._wants_video != "none" or self._wants_trajectory != "none"
 
     def add_observation(self, obs: Obs) -> None:
         for observer in self._observers:
@@ -375,7 +364,7 @@ class Recording(EpisodeRecorder):
         for observer in self._observers:
             observer.add_action(action, reward, success)
 
-    def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
+    def finish(self, result: EpisodeResult) -> Artifacts:
         """Return the video and the trajectory of the episode, if the settings choose the
         episode.
         """
@@ -383,12 +372,6 @@ class Recording(EpisodeRecorder):
         wants_trajectory = _is_chosen(self._wants_trajectory, result)
         if not wants_video and not wants_trajectory:
             return Artifacts()
-
-        if self._played.lacks_images:
-            self.close()
-            reason = second_pass(self._played, self._add_images)
-            if reason is not None:
-                return Artifacts(not_repeatable=reason)
 
         videos = self._video.finish()
         policy_videos = videos
@@ -398,10 +381,6 @@ class Recording(EpisodeRecorder):
         return Artifacts(
             videos if wants_video else {}, policy_videos if wants_trajectory else {}, trajectory
         )
-
-    def _add_images(self, obs: Obs) -> None:
-        for video in self._recorded_videos:
-            video.add_observation(obs)
 
     def close(self) -> None:
         for video in self._recorded_videos:

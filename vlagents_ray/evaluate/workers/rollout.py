@@ -29,11 +29,7 @@ from vlagents_ray.envs import make_env
 from vlagents_ray.envs.base import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.graphics import require_own
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAgentsError
-from vlagents_ray.evaluate.artifacts.recorder import (
-    Artifacts,
-    EpisodeRecorder,
-    RecorderFactory,
-)
+from vlagents_ray.evaluate.artifacts.recorder import Artifacts, RecorderFactory
 from vlagents_ray.evaluate.episode import episode
 from vlagents_ray.evaluate.episode.failures import (
     Failure,
@@ -111,8 +107,6 @@ class Rollout:
         self._sessions: list[Agent] = []  # further sessions of the agent, for parallel episodes
         self._env: BatchEnv | None = None
         self._env_place: str | None = None  # `EvalCase.place` of the environment
-        self._repeatable = True  # whether every second pass so far has repeated its episode exactly
-        self._surplus = 0  # number of successes minus number of failures in this environment
         self._thread = 0  # id of the thread that runs episodes
         self._current_phase: tuple[episode.Phase, float, int] = ("idle", monotonic(), 0)
 
@@ -206,10 +200,6 @@ class Rollout:
                 recorder = self._recorders(env.contract.control_hz)
                 recordings.append(stack.enter_context(contextlib.closing(recorder)))
 
-            choice = recordings[0].wants_images
-            renders = choice == "all" or (
-                choice == "failures" and self._renders_at_once(agent, env, case.policy)
-            )
             outcomes = episode.run_episodes(
                 env,
                 agent,
@@ -221,14 +211,13 @@ class Rollout:
                 policy_options=case.policy_options,
                 observers=recordings,
                 watch=self._set_phase,
-                images="all" if renders else "requested",
+                images="all" if recordings[0].needs_images else "requested",
             )
 
             reports = []
-            for job, outcome, recording in zip(jobs, outcomes, recordings, strict=True):
+            for outcome, recording in zip(outcomes, recordings, strict=True):
                 if isinstance(outcome, EpisodeResult):
-                    artifacts = self._finish_recording(env, job, outcome, recording)
-                    report = Report(result=outcome, artifacts=artifacts)
+                    report = Report(result=outcome, artifacts=recording.finish(outcome))
                 elif isinstance(outcome, episode.Diverged):
                     failure = replace(explain(outcome.error), diverged=outcome.result)
                     report = Report(failure=failure)
@@ -236,36 +225,6 @@ class Rollout:
                     report = Report(failure=explain(outcome))
                 reports.append(report)
             return reports
-
-    def _finish_recording(
-        self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder
-    ) -> Artifacts:
-        """Return the artifacts of an episode; if images are missing, run the episode again."""
-        reset_options = job.case.suite.reset_options
-        artifacts = recording.finish(
-            result,
-            lambda played, record: played.play_again(
-                env, job.key, reset_options, self._set_phase, record
-            ),
-        )
-        self._repeatable = self._repeatable and artifacts.not_repeatable is None
-        self._surplus += 1 if result.success_once else -1
-        return artifacts
-
-    def _renders_at_once(self, agent: Agent, env: BatchEnv, policy: PolicyConfig) -> bool:
-        """Return whether to render each step when it is executed, if only failures need images.
-
-        The alternative is to run the failed episodes again. This saves nothing if the policy
-        receives every image, costs more than it saves if most episodes fail, and is impossible if
-        one simulator runs several environments together.
-        """
-        rows = policy.execute or (agent.contract.chunk if agent.contract is not None else None)
-        return (
-            rows == 1
-            or self._surplus < 0
-            or not self._repeatable
-            or not isinstance(env, SequentialBatch)
-        )
 
     def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
         """Return an agent for each of `number` parallel episodes."""
@@ -328,8 +287,6 @@ class Rollout:
             raise MissingDependency(f"env {case.env!r} cannot run here: {reason}") from error
 
         self._env_place = case.place
-        self._repeatable = True
-        self._surplus = 0
         return env
 
     def _drop_agent(self) -> None:
