@@ -15,7 +15,7 @@
 #   make dist                                                       what a release publishes, checked, in dist
 #   make release [UPLOAD=1]                                         check, build and tag a version; the tag publishes it
 #   make sbom [LOCK=server-sim]                                     what an image installs and its licences, in build/sbom
-#   make bench                                                      measure, and write docs/measured_tables.md again
+#   make bench                                                      measure this server and others, into build/bench
 #   make gpu [RUN=acts] [DRY=1] [GPU_PYTHON=python3] [STEPS="facts,tests"]     all that needs a GPU, in two runs of seven
 #                                                                   minutes, acts and serving, into build/gpu
 #   make gpu-pack                                                   what `make gpu` needs where there is no network
@@ -86,10 +86,11 @@ reference: setup
 
 # More than half an hour; the other policy servers get two environments of their own, .venv-peers and .venv-peers-torch.
 bench: setup
+	@mkdir -p build/bench
 	$(BIN)/python -m benchmarks.peers
-	$(BIN)/python -m benchmarks.report
-	$(BIN)/python -m benchmarks.evaluation --peers all --report benchmarks/latest.json
-	$(BIN)/python -m benchmarks.report --from-json
+	$(BIN)/python -m benchmarks.rtt --peers all --out build/bench/rtt.json
+	$(BIN)/python -m benchmarks.throughput --peers all --out build/bench/throughput.json
+	$(BIN)/python -m benchmarks.evaluation --peers all --out build/bench/evaluation.json
 
 # GPU_PYTHON is one with torch and transformers. With DRY=1 the steps run in small sizes on a CPU. COMMIT names the commit in a
 # copy without a git folder.

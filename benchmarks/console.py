@@ -19,9 +19,6 @@ Calls = Annotated[int, typer.Option(min=1, help="Number of round trips for each 
 Seconds = Annotated[float, typer.Option(min=0.1, help="Duration of each measurement, in seconds.")]
 Rounds = Annotated[int, typer.Option(min=1)]
 Out = Annotated[Path | None, typer.Option("--out", help="File for the figures, as JSON.")]
-TableOfPage = Annotated[
-    bool, typer.Option("--table", help="Write the table of docs/measured_tables.md again.")
-]
 StateDims = Annotated[
     list[str],
     typer.Option(

@@ -1,5 +1,5 @@
-"""Environments of the measurements: a wrapper of any environment that records its times, and an
-environment that takes time but no CPU.
+"""The environment of the evaluations that are measured: a wrapper of any environment, which records
+its times.
 
 This module imports only the standard library, numpy and this package's light part, since it is also
 imported in the other systems' Python.
@@ -13,16 +13,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
-from vlagents_ray.envs.base import EvalEnv, known_contract, make_env, one_row
+from vlagents_ray.contract import Contract
+from vlagents_ray.envs.base import EvalEnv, known_contract, make_env
 from vlagents_ray.envs.graphics import Renderer
 from vlagents_ray.interface import Act, Obs
 
 TIMED_ENV = "benchmarks.environments:TimedEnv"  # name of the environment for `make_env`
-SLEEPING_ENV = "benchmarks.environments:SleepingEnv"
-ACTION_DIM = 4  # action dimension of `SleepingEnv`
 
 
 class EpisodeTimes(NamedTuple):
@@ -127,42 +123,3 @@ def read_episode_times(folder: Path) -> dict[int, list[EpisodeTimes]]:
             EpisodeTimes(float(a), float(b), int(steps), int(seed)) for a, b, steps, seed in lines
         ]
     return found
-
-
-class SleepingEnv(EvalEnv):
-    """An environment whose steps sleep for `step_ms`, so that many environments run on few cores.
-    An episode has `max_steps` steps.
-    """
-
-    def __init__(self, *, step_ms: float = 20.0, max_steps: int = 50, size: int = 224) -> None:
-        """Make the environment; `size` is the width and height of the only camera, pixels."""
-        self.max_steps = max_steps
-        self._step_s = step_ms / 1e3
-        self._contract = Contract(
-            cameras={"front": CameraSpec(size, size)}, action=ActionSpec(dim=ACTION_DIM)
-        )
-        self._obs = Obs(cameras={"front": np.zeros((size, size, 3), np.uint8)})
-        self._steps = 0
-
-    @property
-    def contract(self) -> Contract:
-        return self._contract
-
-    @property
-    def instruction(self) -> str:
-        return "let time pass"
-
-    def reset(
-        self, *, seed: int, options: Mapping[str, Any] | None = None
-    ) -> tuple[Obs, dict[str, Any]]:
-        self._steps = 0
-        return self._obs, {"success": False}
-
-    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        one_row(act, self._contract)
-        time.sleep(self._step_s)
-        self._steps += 1
-        return self._obs, 0.0, False, self._steps >= self.max_steps, {"success": False}
-
-    def close(self) -> None:
-        """Do nothing: no resource is held."""

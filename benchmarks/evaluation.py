@@ -48,7 +48,6 @@ from benchmarks.console import Out, save, show_skipped
 from benchmarks.environments import TIMED_ENV, read_episode_times
 from benchmarks.line_process import LineProcess, ProcessFailed, our_environment
 from benchmarks.peers import PYTHON, SCRIPTS, PeersPython, installed
-from benchmarks.report import evaluation_outcomes, show_outcomes
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.envs.base import known_contract
@@ -116,7 +115,6 @@ class Played(NamedTuple):
 
     episodes_per_minute: float  # rate from the first reset to the last step
     wall_s: float  # wall time of the whole command, s
-    first_s: float | None = None  # time from the start of the command to the first reset, s
     env_busy: float | None = None  # busy share of the workers' time; only for our evaluation
     policy_busy: float | None = None  # busy share of the replica's time; only for our evaluation
 
@@ -191,7 +189,7 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
     summary = folder / "results" / SUMMARY
     found = json.loads(summary.read_text()) if summary.is_file() else {}
     busy = found.get("env_busy"), found.get("policy_busy")
-    return Played(60 * plan.episodes / playing_s, wall_s, first - begun, *busy)
+    return Played(60 * plan.episodes / playing_s, wall_s, *busy)
 
 
 def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
@@ -292,7 +290,7 @@ def _median(rounds: Sequence[Played]) -> Played:
 
 
 def show_evaluation(found: Mapping[str, Any]) -> None:
-    """Print a row for each system, and the targets."""
+    """Print a row for each system."""
     plan = found["plan"]
     rows = table(
         "",
@@ -318,7 +316,6 @@ def show_evaluation(found: Mapping[str, Any]) -> None:
             name, f"{row['episodes_per_minute']:.0f}", f"{row['wall_s']:.1f}", *busy, *cells
         )
     out.print(rows)
-    show_outcomes(evaluation_outcomes(found))
     show_skipped(found)
 
 
@@ -349,10 +346,6 @@ def main(
     ] = 1,
     peers_python: PeersPython = PYTHON,
     out_file: Out = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(help="Add the figures to this file of `python -m benchmarks.report --out`."),
-    ] = None,
 ) -> None:
     """Measure episodes per minute of whole evaluations: `vlagents-ray eval` and the other systems'
     own commands, interleaved.
@@ -364,8 +357,6 @@ def main(
         )
     show_evaluation(found)
     save(found, out_file)
-    if report is not None:
-        save({**json.loads(report.read_text()), "evaluation": found}, report)
 
 
 if __name__ == "__main__":

@@ -151,7 +151,6 @@ def test_a_plugins_readme_links_to_pages_that_exist(name: str) -> None:
 # Files and folders of tests/ that import plug-ins, with the reason. All other tests need only the
 # core.
 ABOVE_PLUGINS = {
-    "benchmarks": "benchmarks measure plug-ins as well",
     "cli/test_examples.py": "the help of each command has examples, also of plug-ins",
     "cli/test_config_files.py": "one table has each command that reads a file",
     "client/test_hostile_server.py": "one server is slow to clients of the core and of dialects",

@@ -25,7 +25,6 @@ from benchmarks.evaluation import (
 )
 from benchmarks.line_process import ProcessFailed
 from benchmarks.peers import SCRIPTS
-from benchmarks.report import evaluation_outcomes
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.interface import Act
@@ -96,11 +95,9 @@ def test_ours_says_how_busy_both_sides_were(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ours_without_workers_plays_the_plan_soon_after_its_start(tmp_path: Path) -> None:
+def test_ours_without_workers_plays_the_plan(tmp_path: Path) -> None:
     alone_here = replace(FEW, workers=0)
-    played = play(alone_here, our_run(alone_here), tmp_path / "here")
-    assert played.first_s is not None
-    assert 0 < played.first_s < played.wall_s
+    assert play(alone_here, our_run(alone_here), tmp_path / "here").episodes_per_minute > 0
 
 
 @pytest.mark.parametrize(("seeds", "steps"), [(range(3), 3), (range(1, 5), 3), (range(4), 2)])
@@ -114,15 +111,6 @@ def test_whoever_plays_something_else_is_not_compared(
 def test_ratios_are_above_one_where_we_are_faster() -> None:
     found = ratios([Played(200, 10), Played(300, 30)], [Played(100, 20), Played(100, 15)])
     assert found == {"rounds": [2, 3], "median": 2.5, "wall_rounds": [2, 0.5], "wall_median": 1.25}
-
-
-def test_against_one_process_all_cores_must_count() -> None:
-    found = {
-        "cores": 8,
-        "plan": {"workers": 2},
-        "ratios": {"vlagents": {"median": 1.9}, "vla-eval": {"median": 1.9}},
-    }
-    assert [one.met for one in evaluation_outcomes(found)] == [False, True]
 
 
 def test_the_peers_see_these_packages_and_nothing_else_of_ours(tmp_path: Path) -> None:

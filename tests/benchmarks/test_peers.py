@@ -1,5 +1,5 @@
-"""Clients in other languages and other policy servers: which of them are measured, and a script
-that stands in for such a system.
+"""Other policy servers: which of them are measured, and a script that stands in for such a
+system.
 """
 
 from __future__ import annotations
@@ -12,12 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import typescript_client
-from client_servers import client_servers
 from eval_fakes import wait_for
 from peer_environment import peers_python
 
-from benchmarks import clients
 from benchmarks.line_process import ProcessFailed
 from benchmarks.own_clients import observation, save_observation
 from benchmarks.peers import (
@@ -320,26 +317,3 @@ def test_versions_are_those_of_the_other_python() -> None:
     assert set(installed(Path(sys.executable), ["numpy", "no-such-thing"])) == {"numpy"}
     with pytest.raises(ConfigError, match="peers-python"):
         installed(Path("/bin/false"), ["numpy"])
-
-
-@pytest.mark.node
-@pytest.mark.compiler
-def test_all_clients_are_measured_in_turns() -> None:
-    typescript_client.build()
-    with client_servers() as urls:
-        found = clients.measure_clients(urls["VLAGENTS_TEST_URL"], 20)
-    assert [trips.name for trips in found.ours] == [
-        "Python, websocket",
-        "Python, http",
-        clients.CPP,
-        *clients.NODE,
-    ]
-    assert all(trips.rounds.shape == (1, 20) and trips.median > 0 for trips in found.ours)
-
-
-def test_a_client_that_was_not_built_is_named_with_the_cure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(clients, "TYPESCRIPT", tmp_path)
-    with pytest.raises(ConfigError, match="npm run build"):
-        clients.measure_clients("http://127.0.0.1:9", 1)

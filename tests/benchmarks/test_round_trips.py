@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,8 +19,6 @@ from benchmarks.figures import (
     median_ratio,
     ratios,
 )
-from benchmarks.hop import CHILD, IN_PROCESS, measure_hop
-from benchmarks.http_floor import DIRECT, PROXIED, bare_application, page_table
 from benchmarks.own_clients import OWN_CLIENTS, connect, observation, own_clients
 from benchmarks.processes import DAEMONS
 from benchmarks.round_trips import ROUND, in_turns, measure
@@ -164,36 +161,3 @@ def test_what_figures_depend_on_is_json_without_names_of_hosts() -> None:
     assert said.keys() == {"date", "command", "machine", "versions"}
     assert said["versions"].keys() >= {"vlagents-ray", "numpy", "Python"}
     assert said["machine"].keys() == {"cpu", "cores", "memory_gb", "kernel", "load"}
-
-
-@pytest.mark.slow
-def test_both_ways_are_measured_in_turns_and_the_child_costs_time() -> None:
-    here, there = measure_hop(200).ours
-    assert (here.name, there.name) == (IN_PROCESS, CHILD)
-    assert here.rounds.shape == there.rounds.shape == (2, 100)
-    assert 0 < here.median < there.median
-
-
-def test_the_table_of_http_compares_each_way_with_both_bare_applications() -> None:
-    ways = {"http, jpeg": 2.4, DIRECT: 1.5, PROXIED: 2.0}
-    head, rows = page_table(
-        {
-            "ways": [{"way": "http, jpeg", "median_ms": 2.4}],
-            "peers": [{"way": name, "median_ms": ways[name]} for name in (DIRECT, PROXIED)],
-            "ratios": {"http, jpeg": {DIRECT: {"ratio": 1.6}, PROXIED: {"ratio": 1.2}}},
-            "use": {name: {"client": {"cpu_ms": 1}, "server": {"cpu_ms": 2}} for name in ways},
-        }
-    )
-    assert len(head) == 6
-    assert rows == [
-        [DIRECT, "1.50", "", "", "1.00", "2.00"],
-        [PROXIED, "2.00", "", "", "1.00", "2.00"],
-        ["http, jpeg", "2.40", "1.60", "1.20", "1.00", "2.00"],
-    ]
-
-
-@pytest.mark.slow
-def test_the_bare_application_answers_its_client() -> None:
-    with bare_application(Path(), is_proxied=False) as client:
-        assert client.ready() == {}
-        assert len(client.measure(5)) == 5

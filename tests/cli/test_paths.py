@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
 
-
 EPISODE = ["--policy", "scripted", "--episodes", "1", "--workers", "0", "--video", "none"]
 # Command and option -> words; "{path}" stands for the path, and "done" for a folder with results.
 COMMANDS: dict[tuple[str, str], list[str]] = {

@@ -18,8 +18,8 @@ import pytest
 import yaml
 from eval_fakes import HURRY, LINE, PYTHONPATH, Line, Unhurried, wait_for
 from in_process_episode import run_episode
+from simulated_hosts import Host, HostFailed, RayCluster, hosts, ray_cluster
 
-from benchmarks.hosts import Host, HostFailed, RayCluster, hosts, ray_cluster
 from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results

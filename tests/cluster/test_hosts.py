@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from simulated_hosts import Host, HostFailed, hosts, ray_cluster
 
-from benchmarks.hosts import Host, HostFailed, hosts, ray_cluster
 from vlagents_ray.evaluate import Results
 from vlagents_ray.protocol.messages import boot_id
 

@@ -21,9 +21,9 @@ from kuberay import FOLDER, PodMonitor, RayJob, RayService, check, documents, ma
 from packaging.specifiers import SpecifierSet
 from pydantic import ValidationError
 from readme_blocks import check_command
+from simulated_hosts import HostFailed, hosts, ray_cluster
 from typer.testing import CliRunner
 
-from benchmarks.hosts import HostFailed, hosts, ray_cluster
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.serve.access.key_store import new_key

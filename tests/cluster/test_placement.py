@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 from eval_fakes import PYTHONPATH
-
-from benchmarks.hosts import Host, RayCluster, hosts, ray_cluster
+from simulated_hosts import Host, RayCluster, hosts, ray_cluster
 
 pytestmark = pytest.mark.hosts
 

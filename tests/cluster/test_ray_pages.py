@@ -17,8 +17,8 @@ import yaml
 from eval_fakes import wait_for
 from ray.autoscaler._private.util import prepare_config, validate_config
 from readme_blocks import ENV, PYTHON, Block, blocks
+from simulated_hosts import Host, HostFailed, hosts
 
-from benchmarks.hosts import Host, HostFailed, hosts
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.serve.launch.haproxy import ROBOTS, haproxy_binary, ingress_environment
 

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from ray import serve
-from shared_ray import shared_server
 
-from benchmarks.scaling_trace import TracePlan, trace
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
@@ -79,23 +77,6 @@ def gone() -> bool:
         for deployment in app.deployments.values()
         for number in deployment.replica_states.values()
     )
-
-
-@pytest.mark.slow
-@pytest.mark.integration
-def test_a_burst_of_robots_is_in_time_again_after_the_start_of_a_replica(shared_ray: None) -> None:
-    """One replica serves ten of these robots; 15 more join the one that is already there."""
-    scaling = {"max_replicas": 2, "downscale_delay_s": 5}
-    plan = TracePlan(alone_s=5.0, burst_s=40.0, after_s=25.0, autoscaling=scaling)
-    with shared_server(plan.served()) as server:
-        traced = trace(server.url, plan)
-    assert (traced["failed"], traced["resumed"]) == ([], 0)
-    most = [max(replicas) for _, *replicas in traced["replicas"]]
-    assert max(most) == 2
-    assert traced["replicas"][-1][1:] == [1, 1], "the second replica stops after the burst"
-    # Load reports come every 2 s, and are confirmed once; sessions are compared every 3 s.
-    assert traced["requested_s"] < 10
-    assert traced["in_time_s"] < traced["running_s"] + 10
 
 
 @pytest.mark.slow

@@ -17,8 +17,7 @@ import yaml
 from eval_fakes import wait_for
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic.alias_generators import to_camel
-
-from benchmarks.hosts import RayCluster
+from simulated_hosts import RayCluster
 
 FOLDER = Path(__file__).parents[2] / "cluster" / "kuberay"
 KUBERNETES = "1.37"

@@ -122,7 +122,7 @@ def _no_python(version: str) -> str | None:
 @functools.cache
 def no_hosts() -> str | None:
     """Return why tests cannot simulate several hosts here; None if they can."""
-    from benchmarks.hosts import require
+    from simulated_hosts import require
 
     try:
         require()

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -33,10 +32,6 @@ RATES = json.loads((ROOT / "tests/rates.json").read_text())
 LEARNT = json.loads((ROOT / "examples/reference/checkpoint/rates.json").read_text())
 # Results of serving the reference policy, from `benchmarks.success`.
 SERVING_RESULTS = json.loads((ROOT / "examples/reference/success.json").read_text())["ways"]
-
-
-# Results of learners that improve the reference policy, from `benchmarks.learners`.
-LEARNERS = json.loads((ROOT / "examples/reference/learners.json").read_text())
 
 
 def _listed(registered: dict[str, RegistryEntry]) -> Iterator[tuple[str, RegistryEntry]]:
@@ -185,14 +180,6 @@ def ways() -> Iterator[str]:
         yield f"| {row['way']} | {rate} | {off} [{low}, {high}] | {row['p_holm']:.2g} | {equal} |"
 
 
-def learners(*names: str) -> list[str]:
-    """Return the rows of learners that improve the reference policy."""
-    sys.path.append(str(ROOT))  # when it runs as a script, this file cannot import benchmarks/
-    from benchmarks.learners_page import table_rows
-
-    return list(table_rows(LEARNERS, names))
-
-
 def columns() -> Iterator[str]:
     """Yield the rows of the table of an export's columns."""
     yield from ("| column | type | meaning |", "|---|---|---|")
@@ -216,9 +203,6 @@ TABLES: dict[str, dict[str, list[str]]] = {
     "docs/policies/index.md": {"policies": list(policies())},
     "docs/policies/reference.md": {"rates": list(rates())},
     "docs/measured_success.md": {"success": list(ways())},
-    "docs/tutorials/learn.md": {
-        "learners": learners("dagger", "cloning", "cloning_h264", "grpo", "ppo")
-    },
     "docs/programs.md": {
         "programs": list(ran()),
         "settings": list(settings()),

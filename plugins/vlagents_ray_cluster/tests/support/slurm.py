@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eval_fakes import PYTHONPATH, wait_for
-
-from benchmarks.hosts import Host, HostFailed, hosts
+from simulated_hosts import Host, HostFailed, hosts
 
 _TOOLS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "scontrol", "squeue", "scancel")
 _READY_S = 60.0

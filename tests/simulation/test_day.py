@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks import day
+from tests.simulation import day
 from vlagents_ray.robot import MotionLimits
 
 MINUTES = 1 / 60
@@ -65,13 +65,3 @@ def test_a_restart_from_afar_would_be_found(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(day.DayWatchdog, "overdue", lambda self: (self.restart() and None, None))
     report = day.play_day(3, 3 * MINUTES, normal_step=0.02)
     assert any("a command after: stop from afar" in one for one in report.violations)
-
-
-def test_the_cost_of_a_tick_is_measured_with_and_without_the_guard() -> None:
-    measured = day.measure_ticks(200)
-    assert list(measured) == [
-        f"{part}, {joints} joints"
-        for joints in (7, 14)
-        for part in ("guard", "loop", "loop without guard")
-    ]
-    assert all(0 < figures["p50_us"] <= figures["p99_us"] for figures in measured.values())

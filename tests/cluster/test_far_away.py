@@ -1,4 +1,4 @@
-"""A robot whose policy is far away, over a link with delay, loss and interruptions, and through a
+"""A robot on another host than its policy: over a network that is interrupted, and through a
 tunnel.
 """
 
@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,36 +17,18 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from eval_fakes import wait_for
+from eval_fakes import PYTHONPATH, wait_for
+from far_robot import HZ, MAX_AGE_S
+from simulated_hosts import Host, hosts
 
-from benchmarks.far_away import PORT, robot, run, served
-from benchmarks.far_carrier import Conditions
-from benchmarks.far_link import FarLink
-from benchmarks.far_robot import HZ, MAX_AGE_S
-from benchmarks.hosts import Host, hosts
-from benchmarks.line_process import LineProcess, our_environment
+from benchmarks.line_process import LineProcess
 
 pytestmark = pytest.mark.hosts
 
-ECHO = """
-import socket
-s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); s.bind(("", 9000)); print(1, flush=True)
-while True: s.sendto(*s.recvfrom(99))
-"""
-ASK = """
-import json, socket, struct, sys, time
-for line in sys.stdin:
-    s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); s.settimeout(1.5)
-    s.connect((sys.argv[1], 9000))
-    for number in range(int(line)): s.send(struct.pack("id", number, time.monotonic()))
-    took = {}
-    try:
-        while len(took) < int(line):
-            number, sent = struct.unpack("id", s.recv(99))
-            took[number] = time.monotonic() - sent
-    except TimeoutError: pass
-    print(json.dumps(sorted(took.values())), flush=True)
-"""
+PORT = 8000
+START_S = 180.0
+RUN_S = 90.0
+CUT_AFTER_S, CUT_S = 1.0, 3.5
 SSHD = "/usr/sbin/sshd"
 CONFIG = """
 Port 2222
@@ -59,7 +42,7 @@ UsePAM no
 USER = "www-data"
 DRIVE = """
 import json, sys
-from benchmarks.far_robot import FarRobot
+from far_robot import FarRobot
 from vlagents_ray import RemoteAgent
 for url in sys.argv[1:]:
     with RemoteAgent(url) as agent:
@@ -70,60 +53,45 @@ for url in sys.argv[1:]:
 
 
 class Far(NamedTuple):
-    """Two hosts far from each other, with the policy's server on one of them."""
+    """Two hosts, with the policy's server on one of them."""
 
     cloud: Host
     home: Host
-    link: FarLink
     server: LineProcess
+
+
+def process(host: Host, *words: str) -> LineProcess:
+    """Start a process of `far_robot` on a host."""
+    return LineProcess(words[0], host.command([sys.executable, "-m", "far_robot", *words]))
 
 
 @pytest.fixture(scope="module")
 def far() -> Iterator[Far]:
-    with hosts(2) as [cloud, home], FarLink(cloud, home) as link, served(cloud) as server:
-        home.environment |= our_environment()
-        yield Far(cloud, home, link, server)
-
-
-def test_the_link_delays_loses_and_cuts_packets_and_heals(far: Far) -> None:
-    echo = LineProcess("the echo", far.cloud.command([sys.executable, "-c", ECHO]), end_s=0.1)
-    asker = LineProcess(
-        "the asker", far.home.command([sys.executable, "-c", ASK, far.link.address])
-    )
-    with echo, asker:
-        echo.read(30)
-
-        def round_trips_s(count: int) -> list[float]:
-            found: list[float] = asker.request(str(count), 60)
-            return found
-
-        far.link.set(Conditions())
-        assert len(round_trips_s(50)) == 50
-        far.link.set(Conditions(delay_ms=40))
-        delayed = round_trips_s(50)
-        assert len(delayed) == 50
-        assert delayed[0] >= 0.08
-        # In each direction, so about half of the round trips succeed.
-        far.link.set(Conditions(loss=0.3))
-        assert 5 < len(round_trips_s(50)) < 45
-        far.link.set(Conditions(cut=True))
-        assert round_trips_s(5) == []
-        far.link.set(Conditions())
-        assert len(round_trips_s(50)) == 50
+    with hosts(2) as both:
+        cloud, home = both
+        for host in both:
+            host.environment["PYTHONPATH"] = PYTHONPATH
+        with process(cloud, "serve", str(PORT)) as server:
+            server.read(START_S)
+            yield Far(cloud, home, server)
 
 
 def test_a_robot_stands_while_the_link_is_cut_and_then_goes_on_by_itself_with_what_it_sees_then(
     far: Far,
 ) -> None:
-    with robot(far.home, f"http://{far.link.address}:{PORT}") as arm:
+    with process(far.home, "drive", f"http://{far.cloud.address}:{PORT}") as arm:
+        arm.read(START_S)
         _, before = far.server.request("sessions", 30)
-        conditions = Conditions(delay_ms=40, loss=0.01, mbit=20)
-        found, healed = run(
-            arm, far.link, conditions, 3.5, 1.0, seconds=90, mode="async", recovers=True
-        )
+        arm.send(json.dumps({"seconds": RUN_S}))
+        assert arm.read(START_S) == "begun"
+        time.sleep(CUT_AFTER_S)
+        far.home.cut()
+        time.sleep(CUT_S)
+        far.home.heal()
+        healed = time.monotonic()
+        found = arm.read(RUN_S + START_S)
     wait_for(lambda: far.server.request("sessions", 30)[0] == 0)  # no session is left
     _, opened = far.server.request("sessions", 30)
-    assert healed is not None
     ticks = found["ticks"]
     at, acted = np.array(ticks["at_s"]), np.array(ticks["acted"])
     assert len(found["barks"]) == 1, found["barks"]
@@ -192,11 +160,10 @@ def tunnel(near: Host, far: Host, address: str, *forwarded: str) -> Iterator[Non
 def test_a_robot_reaches_its_policy_through_a_tunnel_from_either_side(far: Far) -> None:
     if not Path(SSHD).exists():
         pytest.skip(f"no {SSHD} (Debian: openssh-server)")
-    far.link.set(Conditions(delay_ms=10))
-    from_home = tunnel(far.home, far.cloud, far.link.address, "-L", f"9000:127.0.0.1:{PORT}")
+    from_home = tunnel(far.home, far.cloud, far.cloud.address, "-L", f"9000:127.0.0.1:{PORT}")
     with (
         from_home,
-        tunnel(far.cloud, far.home, far.link.other_address, "-R", f"9001:127.0.0.1:{PORT}"),
+        tunnel(far.cloud, far.home, far.home.address, "-R", f"9001:127.0.0.1:{PORT}"),
     ):
         urls = [f"http://127.0.0.1:{port}" for port in (9000, 9001)]
         said = far.home.run([sys.executable, "-c", DRIVE, *urls]).splitlines()

@@ -1,6 +1,6 @@
 """Tests that a day of control has no jump.
 
-`python -m benchmarks.day --seed 1` simulates 24 hours at 50 Hz with faults. Control loop, chunk
+`python -m tests.simulation.day --seed 1` simulates 24 hours at 50 Hz with faults. Control loop, chunk
 player, guard, watchdog and command inbox are those of a real robot; the arm, the network, the
 server, the operator and all clocks are simulated, so that a day takes some minutes, and a seed
 repeats it exactly. At each command the simulation checks:
@@ -11,29 +11,23 @@ repeats it exactly. At each command the simulation checks:
 
 `--relative` runs the day with relative actions, `--arms 2` with two arms. The exit status is 0
 without a violation, otherwise 1. The report has the time of a violation, which the same seed and a
-suitable `--hours` repeat. `--ticks 20000` instead measures the cost of a tick: the guard alone, and
-from `observe` to `apply` with and without the guard.
+suitable `--hours` repeat.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import math
-import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Annotated
 from unittest import mock
 
 import numpy as np
 import typer
 
-from benchmarks.console import Out, save
 from vlagents_ray.chunking import buffer, player
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.console import errors, out
@@ -48,7 +42,6 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import CAPTURED, Act, Agent, Obs
 from vlagents_ray.robot import Guard, LoopOptions, MotionLimits, Watchdog, loop, run_loop, watchdog
-from vlagents_ray.robot.simulated import SimulatedRobot
 
 HZ = 50.0
 # Duration of a run of the control loop, s; between two runs the arm goes to its rest pose.
@@ -508,115 +501,18 @@ def play_day(
     return world.finished()
 
 
-class CirclePolicy(Agent):
-    """Moves all joints back and forth, beginning at rest."""
-
-    contract: Contract | None = None
-
-    def __init__(self, joints: int) -> None:
-        self.contract = Contract(action=ActionSpec(dim=joints, delta=False), chunk=CHUNK)
-        self._joints, self._asked = joints, 0
-
-    def act(self, obs: Obs) -> Act:
-        rows = [self.row(self._asked * CHUNK + i) for i in range(CHUNK)]
-        self._asked += 1
-        return Act(np.stack(rows))
-
-    def row(self, tick: int) -> np.ndarray:
-        """Return the action of a tick, (D,) float32 rad."""
-        return np.full(self._joints, _RADIUS * (1 - math.cos(_TURN * tick)), np.float32)
-
-
-def limits_of(joints: int) -> MotionLimits:
-    """Return limits of speed, acceleration, jerk and the workspace of an arm's tip behind its
-    first seven joints.
-    """
-    links = "".join(
-        f'<joint name="{i}" type="revolute"><parent link="{i}"/><child link="{i + 1}"/><origin '
-        'xyz="0 0 0.15" '
-        f'rpy="{(-1) ** i * 1.57} 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" '
-        'velocity="2"/></joint>'
-        for i in range(joints)
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        Path(folder, "arm.urdf").write_text(f"<robot name='arm'>{links}</robot>")
-        workspace = {"workspace_low": [-2.0, -2.0, -2.0], "workspace_high": [2.0, 2.0, 2.0]}
-        Path(folder, "arm.json").write_text(
-            json.dumps({"urdf": "arm.urdf", "tip": "7", **workspace})
-        )
-        read = MotionLimits.read(Path(folder, "arm.json"))
-    return replace(read, acceleration=LIMITS.acceleration, jerk=LIMITS.jerk)
-
-
-def tick_us(joints: int, ticks: int, *, part: str) -> list[float]:
-    """Measure a part of each tick, µs: "guard", or the time from `observe` to `apply` as "loop" or
-    "loop without guard".
-    """
-    policy, took = CirclePolicy(joints), list[float]()
-    guard = (
-        None
-        if part == "loop without guard"
-        else Guard(policy.contract, limits=limits_of(joints), hz=HZ)
-    )
-    if part == "guard" and guard is not None:
-        last = guard(policy.row(0))
-        for tick in range(1, ticks):
-            action = policy.row(tick)
-            begun = time.perf_counter()
-            last = guard(action, last)
-            took.append(1e6 * (time.perf_counter() - begun))
-        return took
-    robot = SimulatedRobot(policy.contract)
-    with ChunkPlayer(
-        policy, PlayerSettings(mode="open_loop", deadline_s=1.0), check=guard
-    ) as driver:
-        driver.initialize()
-        driver.reset(robot.observe())
-        for _ in range(ticks):
-            begun = time.perf_counter()
-            robot.apply(driver.act(robot.observe()).action)
-            took.append(1e6 * (time.perf_counter() - begun))
-    return took
-
-
-def measure_ticks(ticks: int) -> dict[str, dict[str, float]]:
-    """Return the median and the 99 % quantile of each part of a tick, µs."""
-    found = {}
-    for joints in (7, 14):
-        for part in ("guard", "loop", "loop without guard"):
-            tick_us(joints, ticks // 10, part=part)  # warms up
-            p50, p99 = np.quantile(tick_us(joints, ticks, part=part), [0.5, 0.99])
-            found[f"{part}, {joints} joints"] = {
-                "p50_us": round(float(p50), 1),
-                "p99_us": round(float(p99), 1),
-            }
-    return found
-
-
 def main(
     seed: int = 0,
     hours: Annotated[float, typer.Option(help="of simulated time")] = 24.0,
     relative: Annotated[bool, typer.Option(help="simulate the day with relative actions")] = False,
     arms: Annotated[int, typer.Option(min=1, max=8)] = 1,
-    ticks: Annotated[
-        int,
-        typer.Option(help="measure the cost of this number of ticks instead of simulating a day"),
-    ] = 0,
-    out_file: Out = None,
 ) -> None:
     """Simulate a day with faults, and compare its steps with those of ten minutes without
     faults.
     """
-    if ticks:
-        measured = measure_ticks(ticks)
-        save({"ticks": measured}, out_file)
-        for name, figures in measured.items():
-            out.print(f"{name}: {figures}")
-        return
     with errors():
         normal = play_day(seed, 1 / 6, faults=False, relative=relative, arms=arms).largest_step
         report = play_day(seed, hours, normal_step=normal, relative=relative, arms=arms)
-    save({"day": asdict(report)}, out_file)
     for name, value in asdict(report).items():
         out.print(f"{name}: {value}")
     if report.violations:

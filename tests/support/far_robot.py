@@ -1,26 +1,28 @@
-"""A robot far from its policy, which records each tick (`python -m benchmarks.far_robot URL`), and
-the policy.
+"""A robot far from its policy, which records each tick, and the policy behind the endpoints of a
+replica, each in a process.
 
-Each line that the process reads is a run, {"mode": "async", "seconds": 20}. It answers with a line
-when the loop begins, and with its record when the loop ends.
+`python far_robot.py drive URL` answers each line, {"seconds": 20}, with a line when the loop
+begins, and with its record when the loop ends. `python far_robot.py serve PORT` answers each line
+with the numbers of current and of opened sessions.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, Field
 
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.interface import DELAY, LEFTOVER, SAFE, Act, Agent, Obs
+from vlagents_ray.interface import SAFE, Act, Agent, Obs
 from vlagents_ray.robot.guard import Guard
 from vlagents_ray.robot.loop import LoopOptions, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
@@ -36,20 +38,7 @@ MAX_STEP = 0.2  # maximum step of the guard
 _TURN = 2 * np.pi / (4 * HZ)  # change of the path's angle in a tick, rad: one round takes 4 s
 _SWAY = 0.03  # distance of the paths of two chunks
 _IMAGE = 224  # size of images, px
-# The player's options in each mode. With a deadline of 0, no tick waits for the network.
-MODES: Mapping[str, Mapping[str, Any]] = {
-    "single actions": {"mode": "open_loop", "horizon": 1},
-    "open loop": {"mode": "open_loop"},
-    "ensemble": {"mode": "ensemble"},
-    "async": {"mode": "async"},
-    "RTC": {"mode": "async", "real_time_chunking": True},
-}
-
-
-class FarConfig(BaseModel, extra="forbid"):
-    """The policy's computing time."""
-
-    ms: float = Field(default=60.0, ge=0, description="duration of a batch")
+_COMPUTING_S = 0.06  # duration of a batch, s
 
 
 class FarPolicy(Agent):
@@ -57,15 +46,10 @@ class FarPolicy(Agent):
     policy.
 
     A row contains the position, the tick of its observation, and the number of observations that
-    arrived twice. With real-time chunking a chunk begins with the rows that will have been
-    executed, and departs from them gradually.
+    arrived twice.
     """
 
-    Config: ClassVar[type] = FarConfig
-    shared: ClassVar[tuple[str, ...]] = ("config",)
-
-    def __init__(self, config: FarConfig | None = None) -> None:
-        self.config = config or FarConfig()
+    def __init__(self) -> None:
         self._seen: set[int] = set()
         self._twice = 0
         self._random = np.random.default_rng(0)
@@ -85,7 +69,7 @@ class FarPolicy(Agent):
 
     def act(self, obs: Obs) -> Act:
         """Return a chunk, (50, 3) float32."""
-        time.sleep(self.config.ms / 1e3)
+        time.sleep(_COMPUTING_S)
         tick, executed = (int(number) for number in obs.state["ticks"])
         self._twice += tick in self._seen
         self._seen.add(tick)
@@ -93,14 +77,6 @@ class FarPolicy(Agent):
         rows = np.stack([path, np.full(CHUNK, tick), np.full(CHUNK, self._twice)], -1).astype(
             np.float32
         )
-        before = obs.info.get(LEFTOVER)
-        if before is not None:
-            n, frozen = min(CHUNK, len(before)), int(obs.info[DELAY])
-            ours = np.clip((np.arange(n) - frozen + 1) / max(1, n - frozen), 0, 1).astype(
-                np.float32
-            )
-            rows[:n, 0] = ours * rows[:n, 0] + (1 - ours) * before[:n, 0]
-            rows[:frozen] = before[:frozen]
         return Act(rows)
 
 
@@ -112,8 +88,6 @@ class Ticks:
     acted: list[bool] = field(default_factory=list)  # whether the policy's action was executed
     # Age of the observation behind each executed action of the policy, s.
     age_ticks: list[int] = field(default_factory=list)
-    # Distance of each such action from the previous one.
-    step: list[float] = field(default_factory=list)
     twice: int = 0  # number of observations that the policy received twice in one session
 
 
@@ -123,7 +97,6 @@ class FarRobot(SimulatedRobot):
     def __init__(self, contract: Contract | None) -> None:
         super().__init__(contract)
         self.ticks = Ticks()
-        self._before: float | None = None
 
     def observe(self) -> Obs:
         """Begin a tick."""
@@ -143,12 +116,9 @@ class FarRobot(SimulatedRobot):
         """Record an action of the policy that is about to be executed."""
         ticks = self.ticks
         ticks.acted[-1] = True
-        position, tick, twice = (float(number) for number in act.action)
-        ticks.age_ticks.append(len(ticks.at_s) - 1 - int(tick))
-        ticks.twice = int(twice)
-        if self._before is not None:
-            ticks.step.append(abs(position - self._before))
-        self._before = position
+        _, tick, twice = (int(number) for number in act.action)
+        ticks.age_ticks.append(len(ticks.at_s) - 1 - tick)
+        ticks.twice = twice
 
 
 class NotingPlayer(ChunkPlayer):
@@ -178,26 +148,20 @@ class NotingAgent(RemoteAgent):
         return act
 
 
-def drive(
-    url: str,
-    mode: str,
-    seconds: float,
-    *,
-    recovers: bool = False,
-    began: Callable[[], object] = lambda: None,
-) -> dict[str, Any]:
-    """Run the robot with the policy for `seconds`, and return the record.
+def drive(url: str, seconds: float, began: Callable[[], object]) -> dict[str, Any]:
+    """Run the robot with the policy, and return the record.
 
-    With `recovers`, the run ends earlier if the policy has controlled the robot for a second since
-    a stop.
+    The run ends when the policy has controlled the robot for a second since a stop, at the latest
+    after `seconds`.
     """
     with NotingAgent(url, timeout_s=RESET_S) as agent:
         robot = FarRobot(agent.contract)
         low, high = np.array([-1.1, 0, 0]), np.array([1.1, 1e6, 1e6])
         guard = Guard(agent.contract, low=low, high=high, max_step=np.array([MAX_STEP, 1e6, 1e6]))
         watchdog = Watchdog(lambda _: robot.stop(), {"server": SILENCE_S, "loop": 1.0})
+        # With a deadline of 0, no tick waits for the network.
         settings = PlayerSettings(
-            deadline_s=0, safe=robot.here, max_age_s=MAX_AGE_S, timeout_s=ACT_S, **MODES[mode]
+            mode="async", deadline_s=0, safe=robot.here, max_age_s=MAX_AGE_S, timeout_s=ACT_S
         )
         player = NotingPlayer(agent, settings, check=guard)
         player.robot = robot
@@ -208,7 +172,7 @@ def drive(
             if ends == float("inf"):
                 ends = time.monotonic() + seconds
                 began()
-            recovered = recovers and bool(watchdog.barks) and all(robot.ticks.acted[-round(HZ) :])
+            recovered = bool(watchdog.barks) and all(robot.ticks.acted[-round(HZ) :])
             return recovered or time.monotonic() >= ends
 
         report = run_loop(
@@ -222,29 +186,68 @@ def drive(
         )
         found = {
             "ticks": asdict(robot.ticks),
-            "missed": report.jitter["missed"],
             "safe": {**report.safe, "waiting": report.waiting},
             "barks": report.barks,
-            "transport": agent.transport,
-            "codec": str(agent.codec),
-            "reconnects": agent.reconnects,
             "resumed": agent.resumed,
         }
         player.close()
     return found
 
 
+def run_robot(url: str, say: Callable[[Any], None]) -> None:
+    """Run the robot's process until its standard input ends."""
+    say("ready")
+    for line in sys.stdin:
+        say(drive(url, **json.loads(line), began=lambda: say("begun")))
+
+
+def serve(port: int, say: Callable[[Any], None]) -> None:
+    """Run the server's process, without Ray, until its standard input ends."""
+    import uvicorn
+
+    from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
+    from vlagents_ray.serve.access.api_keys import NoKey
+    from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+    from vlagents_ray.serve.endpoints.http import build_http_app
+    from vlagents_ray.serve.endpoints.own_port import OwnPortServer
+    from vlagents_ray.serve.engine.engine import Engine
+    from vlagents_ray.serve.ports import EVERYWHERE
+
+    policy = FarPolicy()
+    engine = Engine(policy)
+    stream = OwnPortServer(engine, DEFAULT_LIMITS, EVERYWHERE, None, NoKey.OPEN)
+    stream.open()
+    engine.start()
+    metadata = {
+        "policy": "far",
+        "version": "0",
+        "protocol": PROTOCOL_VERSION,
+        "stream": asdict(stream.address),
+        "contract": policy.contract.to_json(),
+    }
+    app = AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "far")
+    config = uvicorn.Config(app, host=EVERYWHERE, port=port, log_level="warning")
+    threading.Thread(target=uvicorn.Server(config).run, daemon=True).start()
+    # Clients that connect before uvicorn has started try again.
+    say("ready")
+    for _ in sys.stdin:
+        say([len(engine.sessions), engine.sessions.opened])
+    os._exit(0)  # the server ends even if clients are still connected
+
+
 def main() -> None:
-    """Run the process."""
+    """Run one of the two processes."""
     die_with_parent()
     out = own_stdout()
 
     def say(line: Any) -> None:
         print(json.dumps(line), file=out, flush=True)
 
-    say("ready")
-    for line in sys.stdin:
-        say(drive(sys.argv[1], **json.loads(line), began=lambda: say("begun")))
+    command, argument = sys.argv[1:]
+    if command == "serve":
+        serve(int(argument), say)
+    else:
+        run_robot(argument, say)
 
 
 if __name__ == "__main__":

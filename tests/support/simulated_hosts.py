@@ -15,7 +15,6 @@ in any way. Needs Linux and root.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import secrets
 import shutil
@@ -29,7 +28,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.link import shaping
 from vlagents_ray.errors import ConfigError, VLAgentsError
 
 _NETWORK = "198.18.0."  # network of RFC 2544 for tests
@@ -97,16 +95,9 @@ class Host:
 
     def limit(self, rate: str) -> None:
         """Limit the rate of the host's link in each direction, in the notation of `tc`: "1gbit"."""
-        for words in shaping(rate, None):
-            self._switch(["tc", "qdisc", "replace", "dev", f"port{self.number}", *words])
-            self.run(["tc", "qdisc", "replace", "dev", "eth0", *words])
-
-    def sent_bytes(self) -> int:
-        """Return the number of bytes, including headers, that the host has sent to other hosts so
-        far.
-        """
-        links = json.loads(self.run(["ip", "-json", "-statistics", "link"]))
-        return sum(link["stats64"]["tx"]["bytes"] for link in links if link["ifname"] != "lo")
+        shaping = ["root", "tbf", "rate", rate, "burst", "64kb", "latency", "50ms"]
+        self._switch(["tc", "qdisc", "replace", "dev", f"port{self.number}", *shaping])
+        self.run(["tc", "qdisc", "replace", "dev", "eth0", *shaping])
 
     def kill(self) -> None:
         """Kill all processes of the host at once, like a power failure."""
@@ -150,7 +141,7 @@ def require() -> None:
             f"hosts: {', '.join(missing)} not found; install iproute2, util-linux and mount"
         )
     tried = subprocess.run(
-        ["unshare", "--net", "--mount", "--pid", "--fork", "--mount-proc", "true"],  # noqa: S607
+        ["unshare", "--net", "--mount", "--pid", "--fork", "--mount-proc", "true"],
         capture_output=True,
         text=True,
         check=False,
@@ -227,7 +218,7 @@ def _set_up(host: Host, switch: Sequence[str], number: int) -> None:
     )
     (host.folder / "boot_id").write_text(f"{uuid.uuid4()}\n")
     (host.folder / "ray").mkdir()
-    Path("/tmp/ray").mkdir(exist_ok=True)  # noqa: S108 - Ray uses this folder
+    Path("/tmp/ray").mkdir(exist_ok=True)
     for command in (
         "ip link set lo up",
         f"ip address add {host.address}/24 dev eth0",
