@@ -55,7 +55,7 @@ TEST_PROCESSES ?= 3
 CHECK_PROCESSES ?= 4
 # Marked so: what wants more than Python, takes more than a second, or wants the machine for itself (pyproject.toml,
 # tests/support/needs.py).
-NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow or integration
+NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or compiler or alone or slow or integration
 # Environments of model families and simulators, in $(VENV)-NAME: NAME.txt in requirements/ of a plug-in, or of tests/. What is
 # tested in each is in the folders families/NAME of the plug-ins' tests. Those whose code is on no package
 # index want its source, too: OPENPI_SRC, OPENVLA_SRC,

@@ -8,8 +8,8 @@
 #
 #   CURL_CA_BUNDLE=ca.pem VLAGENTS_RAY_API_KEY=vlr_... bash curl.sh https://gpu-box:8000 picture.jpg
 #
-# docs/protocol.md is the specification. Loops in languages that robots use are clients/cpp/examples/loop.cpp and
-# clients/typescript/examples/loop.mjs, over WebSockets, with chunks that are executed while the next one is computed.
+# docs/protocol.md is the specification. clients/cpp/examples/loop.cpp is a loop in C++ over WebSockets, with chunks that
+# are executed while the next one is computed.
 set -euo pipefail
 url=$1 picture=$2  # a JPEG or PNG of the camera
 session=robot-$$   # no other robot has this name

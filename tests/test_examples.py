@@ -11,10 +11,15 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
-from client_servers import client_servers
+from asgi_server import policy_server
+from in_memory_keys import ChangingKeys
 from readme_blocks import EXAMPLES, ROOT, code_of
+
+from vlagents_ray.interface import Act, Agent, Obs
 
 INDEX = (EXAMPLES / "README.md").read_text()
 FILES = sorted(path for path in EXAMPLES.iterdir() if path.suffix in (".py", ".sh", ".ipynb"))
@@ -88,15 +93,32 @@ def test_the_later_checkpoint_is_shown_to_be_better(
     assert float(p) < 0.05
 
 
+class Counting(Agent):
+    """A policy that answers with the number of earlier calls and with the gripper, in the first of
+    two rows.
+    """
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self._acts = 0
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        rows = np.array([[self._acts, obs.gripper, 5], [-1, -1, -1]], np.float32)
+        self._acts += 1
+        return Act(rows)
+
+
 def test_a_shell_is_a_client_with_a_key_or_is_told_that_it_lacks_one() -> None:
-    with client_servers() as server:
+    keys = ChangingKeys()
+    key = keys.add("robot")
+    with policy_server(Counting(), keys=keys.keys) as port:
         command = [
             "bash",
             EXAMPLES / "curl.sh",
-            server["VLAGENTS_TEST_KEYED_URL"],
+            f"http://127.0.0.1:{port}",
             ROOT / "clients/golden/gray.jpg",
         ]
-        for environment in ({"VLAGENTS_RAY_API_KEY": server["VLAGENTS_TEST_KEY"]}, {}):
+        for environment in ({"VLAGENTS_RAY_API_KEY": key}, {}):
             done = subprocess.run(
                 command,
                 check=False,
@@ -106,7 +128,7 @@ def test_a_shell_is_a_client_with_a_key_or_is_told_that_it_lacks_one() -> None:
                 timeout=60,
             )
             if environment:
-                told = re.findall(r"^tick (\d+): (\d+)\.0,0\.0,1\.0,", done.stdout, re.MULTILINE)
+                told = re.findall(r"^tick (\d+): (\d+)\.0,1\.0,5\.0$", done.stdout, re.MULTILINE)
                 assert told == [(str(tick), str(tick - 1)) for tick in range(1, 11)]
                 assert (done.returncode, done.stderr) == (0, "")
             else:

@@ -15,6 +15,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from vlagents_ray import Agent
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
+from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -54,13 +55,18 @@ async def _serve(server: uvicorn.Server) -> None:
 
 @contextlib.contextmanager
 def policy_server(
-    agent: Agent, asked: Counter[str] | None = None, **metadata: Any
+    agent: Agent,
+    asked: Counter[str] | None = None,
+    keys: Keys | None = None,
+    **metadata: Any,
 ) -> Iterator[int]:
-    """Serve a policy without Ray, and yield the port; `asked` counts the requests by path."""
+    """Serve a policy without Ray, and yield the port; `asked` counts the requests by path, and
+    `keys` are the API keys, if any is needed.
+    """
     engine = Engine(agent)
     engine.start()
     about = {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION, **metadata}
-    inside = AccessMiddleware(build_http_app(engine, lambda: about, DEFAULT_LIMITS), None, "app")
+    inside = AccessMiddleware(build_http_app(engine, lambda: about, DEFAULT_LIMITS), keys, "app")
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
         if asked is not None:

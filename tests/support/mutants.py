@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[2]
 
 # Excluded markers: mutants run only against tests that need no other resources.
 MARKS = (
-    "not (ray or server or hosts or sim or vulkan or gpu or browser or node or compiler or alone"
+    "not (ray or server or hosts or sim or vulkan or gpu or browser or compiler or alone"
     " or integration)"
 )
 RELATED_FILES = 6  # number of test files that run first

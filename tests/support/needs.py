@@ -28,7 +28,6 @@ from typing import TypeVar
 import pytest
 from browser import CHROMIUM
 from cpp_client import no_compiler
-from typescript_client import node_version
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.python_env.create import find_python, has_gpu
@@ -40,7 +39,7 @@ INTEGRATION = "integration"
 _RAY = ("ray", "server", "hosts")
 # Tests with these markers need a rare machine or take minutes, so they belong to the tier
 # `integration`.
-_INTEGRATION = ("browser", "compiler", "hosts", "node", "vulkan")
+_INTEGRATION = ("browser", "compiler", "hosts", "vulkan")
 _SIMULATORS = {
     "gym_pusht",
     "gymnasium_robotics",
@@ -135,10 +134,6 @@ def _no_browser() -> str | None:
     return None if CHROMIUM else "no Chromium"
 
 
-def _no_node() -> str | None:
-    return None if node_version() >= 18 else "no Node.js 18 with npm"
-
-
 def _no_vulkan() -> str | None:
     from vlagents_ray.envs.maniskill import ManiSkill
 
@@ -156,7 +151,6 @@ _WHY_MISSING: dict[str, Callable[..., str | None]] = {
     "hosts": no_hosts,
     "compiler": no_compiler,
     "browser": _no_browser,
-    "node": _no_node,
     "vulkan": _no_vulkan,
 }
 

@@ -120,8 +120,8 @@ class Keys:
         if not token:
             self.audit.refused("", "no key")
             raise Unauthorized(
-                f"this server needs an API key: set {KEY_VARIABLE}, or api_key= (Python, C++), the "
-                "option `key` (TypeScript) or the header 'Authorization: Bearer KEY' (HTTP)"
+                f"this server needs an API key: set {KEY_VARIABLE}, api_key= (Python, C++) or the "
+                "header 'Authorization: Bearer KEY' (HTTP)"
             )
 
         self._refresh()
