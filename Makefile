@@ -6,11 +6,11 @@
 #   make test [TEST_PROCESSES=3]                                    lint, types, layers, all tests but integrations
 #   make integrations [TEST_PROCESSES=3]                            families, and tests of other systems and of endurance
 #   make families [FAMILIES="lerobot lerobot06 hf rcs libero libero_pro …"]    tests of model families, in .venv-NAME each
-#   make verified [FAMILIES="lerobot hf"]                           what they verify, into docs/policies/verification.md
+#   make verified [FAMILIES="lerobot hf"]                           what they verify, into verified.json beside these tests
 #   make rays, make pythons                                         serve, act and evaluate once with other versions of Ray and Python
-#   make programs                                                   those that others wrote, into the table of docs/programs.md
+#   make programs                                                   those that others wrote, into tests/programs.json
 #   make docs                                                       the site of docs/, in build/docs, for a browser
-#   make extras [ONLY="record sim"]                                 resolve extras, into the table of docs/install.md
+#   make extras [ONLY="record sim"]                                 resolve extras, into tests/extras.json
 #   make locks [ONLY=family-hf]                                     resolve the images' packages, into cluster/docker/locks
 #   make dist                                                       what a release publishes, checked, in dist
 #   make release [UPLOAD=1]                                         check, build and tag a version; the tag publishes it
@@ -155,7 +155,6 @@ verified-%: $(VENV)-%/.installed
 
 verified:
 	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero libero_pro rcs ros torchrl,$(FAMILIES)))
-	$(BIN)/python tests/support/verified.py
 
 # Each in an environment of its own; Stable-Baselines3 and TorchRL in folders beside the torch of this one. openpi's examples want OPENPI_SRC, and
 # LeRobot 0.6 FAMILIES="lerobot lerobot06".
@@ -169,7 +168,7 @@ programs: setup $(patsubst %,$(VENV)-%/.installed,$(filter lerobot%,$(FAMILIES))
 	$(BIN)/python -m pytest $$options $(PROGRAMS) || status=1; \
 	for family in $(filter lerobot%,$(FAMILIES)); do \
 	  $(VENV)-$$family/bin/python -m pytest $$options plugins/vlagents_ray_models/tests/families/lerobot || status=1; done; \
-	$(BIN)/python tests/support/tables.py; exit $$status
+	exit $$status
 
 # Each in an environment of its own: Ray's with Python 3.11, and Pythons, where they are installed, with the newest Ray.
 rays pythons: setup
@@ -185,7 +184,8 @@ $(VENV)-%/.installed: %.txt tests/requirements/testing.txt $(wildcard $(REQUIREM
 	  $(if $(TORCH_CUDA),--cuda) --out $(VENV)-$*
 	@touch $@
 
-# From the sources alone: nothing of what the reference describes is imported.
+# The reference of Python comes from the sources; for that of commands and settings, docs/hooks.py imports the server and its
+# plug-ins, without torch and simulators.
 docs: $(VENV)-docs/.installed
 	@echo '== site of docs/, into build/docs'
 	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --quiet --strict
@@ -278,11 +278,12 @@ $(VENV)-check/.installed: $(PROJECTS)
 	  $(foreach plugin,$(PLUGINS),--editable plugins/vlagents_ray_$(plugin))
 	@touch $@
 
-$(VENV)-docs/.installed: pyproject.toml
+$(VENV)-docs/.installed: $(PROJECTS)
 	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
 	'$(PYTHON)' -m venv $(VENV)-docs
 	@echo '== installing what the site needs into $(VENV)-docs'
-	$(VENV)-docs/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[docs]'
+	$(VENV)-docs/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[docs]' \
+	  $(foreach plugin,$(PLUGINS),--editable plugins/vlagents_ray_$(plugin))
 	@touch $@
 
 # Torch first and alone, so that no other package chooses its build; the constraints hold it (and Ray, which

@@ -331,9 +331,7 @@ def compared(found: Sequence[Played]) -> list[dict[str, Any]]:
 
 
 def shown(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the table for the terminal; tests/support/tables.py makes the table for the
-    documentation.
-    """
+    """Return the table for the terminal; docs/generate makes the table for the site."""
     found = table("way", "success, %", "difference", "p", "equal", "ms an act")
     for row in rows:
         low, high = (f"{100 * bound:.0f}" for bound in row["interval_95"])

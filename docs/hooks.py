@@ -1,5 +1,5 @@
-"""Hooks of MkDocs that add pages and files from outside docs/ to the site, at their paths in the
-repository.
+"""Hooks of MkDocs that write the generated parts of pages, and add pages and files from outside
+docs/ to the site, at their paths in the repository.
 
 Links in the Markdown are relative paths in the repository, so that they also work in a checkout and
 on GitHub. On the site, docs/ is the root, and a link to a file outside docs/ leads to a copy of
@@ -10,12 +10,20 @@ from __future__ import annotations
 
 import posixpath
 import re
+import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[1]
+# The parts are generated from the code, and from the results of tests and measurements.
+sys.path += [str(ROOT / "docs/generate"), str(ROOT / "tests/support")]
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # a warning fails a strict build
+    from generated import filled
+
 PAGES = (
     "ARCHITECTURE.md",
     "CHANGELOG.md",
@@ -35,7 +43,7 @@ def on_files(files: Files, config: Any) -> Files:
     for name in PAGES:
         files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
     for file in list(files.documentation_pages()):
-        for link in _LINK.finditer(file.content_string):
+        for link in _LINK.finditer(filled(file.content_string)):
             path = _path(file.src_uri, link["path"])
             if (
                 not path.startswith("docs/")
@@ -47,7 +55,9 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Remove comments that only tests read, and rewrite links to the paths on the site."""
+    """Write the generated parts, remove comments that only tests read, and rewrite links to the
+    paths on the site.
+    """
     here = page.file.src_uri
 
     def turned(link: re.Match[str]) -> str:
@@ -57,7 +67,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         uri = posixpath.relpath(path.removeprefix("docs/"), posixpath.dirname(here) or ".")
         return f"[{link['text']}]({uri}{link['anchor'] or ''})"
 
-    return _LINK.sub(turned, _ABOVE_A_BLOCK.sub("", markdown))
+    return _LINK.sub(turned, _ABOVE_A_BLOCK.sub("", filled(markdown)))
 
 
 def on_nav(nav: Any, config: Any, files: Files) -> None:

@@ -1,4 +1,6 @@
-"""The commands, options, keys and files in the pages under docs/ are valid."""
+"""The commands, options, keys and files in the pages under docs/ are valid, also in the parts that
+are generated for the site. `mkdocs build --strict` checks links and sections.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from generated import filled
 from ray.serve.schema import ServeApplicationSchema
-from readme_blocks import PAGES, commands, options_of, read_as_typed
+from readme_blocks import PAGES, commands, options_of, read_as_typed, section
 from reference import sections
-from tables import section
 
+from vlagents_ray import registry
 from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.envs.gymnasium import defaults_for
 from vlagents_ray.envs.simulator import BenchmarkProtocol
@@ -59,18 +62,23 @@ def test_an_environment_as_it_is_documented_is_accepted(block: str) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "page", sorted([ROOT / "SECURITY.md", *DOCS.rglob("*.md")]), ids=lambda page: page.name
-)
-def test_the_tests_that_a_page_names_exist(page: Path) -> None:
-    named = set(re.findall(r"`((?:tests|\w+/tests)/[\w/]+\.py)`", page.read_text()))
+@pytest.fixture(scope="module")
+def texts() -> dict[str, str]:
+    """Return the text of each page as on the site, by its path in the checkout."""
+    return {str(page.relative_to(ROOT)): filled(page.read_text()) for page in PAGES}
+
+
+def test_the_tests_that_pages_name_exist(texts: dict[str, str]) -> None:
     folders = [ROOT, ROOT / "plugins"]
     missing = []
-    for name in named:
-        if not any((top / name).is_file() for top in folders):
-            missing.append(name)
+    for page, text in texts.items():
+        named = set(re.findall(r"`((?:tests|\w+/tests)/[\w/]+\.py)`", text))
+        for name in named:
+            if not any((top / name).is_file() for top in folders):
+                missing.append(f"{page}: {name}")
+        if page == "docs/guarantees.md":
+            assert named
     assert missing == []
-    assert named or page.name != "guarantees.md"
 
 
 def test_the_tables_of_tests_that_contributing_names_exist() -> None:
@@ -84,10 +92,15 @@ def test_the_tables_of_tests_that_contributing_names_exist() -> None:
     assert len(tables) >= 6
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_the_commands_on_a_page_are_such_as_the_command_line_takes(page: Path) -> None:
-    for line, whole in commands(page.read_text()):
-        read_as_typed(line, whole=whole)
+def test_the_commands_on_pages_are_such_as_the_command_line_takes(texts: dict[str, str]) -> None:
+    wrong = []
+    for page, text in texts.items():
+        for line, whole in commands(text):
+            try:
+                read_as_typed(line, whole=whole)
+            except ValueError as error:
+                wrong.append(f"{page}: {error}")
+    assert wrong == []
 
 
 # Commands whose options a page explains without a line that begins with `vlagents-ray`.
@@ -150,13 +163,17 @@ OF_OTHERS = {
 }
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_an_option_in_a_sentence_is_one_of_a_command_that_the_page_names(page: Path) -> None:
+def test_an_option_in_a_sentence_is_one_of_a_command_that_its_page_names(
+    texts: dict[str, str],
+) -> None:
     """For example, `--only` in the text about `open-loop`, whose option is `--episodes`, would lead
     readers to an error.
     """
-    explained = [f"vlagents-ray {command}" for command in EXPLAINED.get(page.name, [])]
-    assert unknown_options(page.read_text(), explained) == []
+    unknown = []
+    for page, text in texts.items():
+        explained = [f"vlagents-ray {command}" for command in EXPLAINED.get(Path(page).name, [])]
+        unknown += [f"{page}: {option}" for option in unknown_options(text, explained)]
+    assert unknown == []
 
 
 def test_an_option_that_no_command_of_its_page_has_is_found() -> None:
@@ -194,9 +211,9 @@ KEYS = keys_by_section()
 NO_KEYS = {"checkpoints.swap"}  # keys in the statistics of a server
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_key_of_a_file_in_a_sentence_exists(page: Path) -> None:
-    assert unknown_keys(page.read_text()) == []
+def test_a_key_of_a_file_in_a_sentence_exists(texts: dict[str, str]) -> None:
+    unknown = [f"{page}: {key}" for page, text in texts.items() for key in unknown_keys(text)]
+    assert unknown == []
 
 
 def test_a_key_that_no_file_has_is_found() -> None:
@@ -233,8 +250,8 @@ def test_a_command_that_is_typed_wrong_is_found(line: str, says: str) -> None:
         read_as_typed(line, whole=True)
 
 
-def test_there_are_commands_and_blocks_on_the_pages() -> None:
-    found = [one for page in PAGES for one in commands(page.read_text())]
+def test_there_are_commands_and_blocks_on_the_pages(texts: dict[str, str]) -> None:
+    found = [command for text in texts.values() for command in commands(text)]
     assert len([line for line, whole in found if whole]) > 40
     assert (len(found) > 70, len(BLOCKS)) == (True, 2)
 
@@ -325,6 +342,16 @@ def test_the_protocol_states_the_limits_that_hold(name: str) -> None:
     assert any(f" {getattr(MessageLimits(), name):,} " in row for row in rows)
 
 
+def test_each_dialect_is_shown_among_the_clients_of_other_systems() -> None:
+    pages = [DOCS / "other_clients.md", *sorted((DOCS / "clients").glob("*.md"))]
+    text = "\n".join(page.read_text() for page in pages)
+    lacking = []
+    for name in registry.names("dialects"):
+        if not re.search(rf"\b{name}:( {{|$)", text, re.MULTILINE):
+            lacking.append(name)
+    assert lacking == []
+
+
 def test_the_figures_of_the_readme_are_the_measured_ones() -> None:
     own, link = re.split(r"Round trips of one call over a link", _read("measured_tables.md"))
     for table, names, row in (
@@ -376,26 +403,6 @@ def test_the_pictures_are_those_that_their_script_draws() -> None:
         assert file.read_text() == picture(), f"run {drawn['__file__']}"
 
 
-def test_every_page_stands_in_the_navigation_of_the_site() -> None:
-    navigation = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
-    pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
-    outside = {page.name for page in ROOT.glob("*.md")} | {
-        "examples/README.md",
-        "examples/experts/README.md",
-        "tests/README.md",
-    }
-    assert pages == navigation - outside
-
-
-@pytest.mark.parametrize(
-    "page", [*ROOT.glob("*.md"), *DOCS.rglob("*.md")], ids=lambda page: page.name
-)
-def test_what_a_page_links_to_exists(page: Path) -> None:
-    prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
-    linked = re.findall(r"\]\((?!\w+:)([^)#\s]+)", prose)
-    assert [path for path in linked if not (page.parent / path).exists()] == []
-
-
 def _anchors(page: Path) -> set[str]:
     """Return the anchors of a page's headings in the form of the site and of code hosts."""
     prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
@@ -404,17 +411,17 @@ def _anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\s-]", "", heading).strip().lower().replace(" ", "-") for heading in plain}
 
 
-@pytest.mark.parametrize(
-    "page", [*ROOT.glob("*.md"), *DOCS.rglob("*.md")], ids=lambda page: page.name
-)
-def test_the_sections_that_a_page_links_to_exist(page: Path) -> None:
-    prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
-    missing = []
-    for path, anchor in re.findall(r"\]\((?!\w+:)([^)#\s]*\.md|)#([^)\s]+)\)", prose):
-        target = page.parent / path if path else page
-        if anchor not in _anchors(target):
-            missing.append(f"{path}#{anchor}")
-    assert missing == []
+def test_readmes_that_are_not_on_the_site_link_to_files_and_sections_that_exist() -> None:
+    pages = [ROOT / "README.md", *ROOT.glob("plugins/*/README.md"), *ROOT.glob("clients/*/*.md")]
+    broken = []
+    for page in pages:
+        prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+        for path, anchor in re.findall(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)", prose):
+            target = page.parent / path if path else page
+            if not target.exists() or (anchor and anchor not in _anchors(target)):
+                broken.append(f"{page.relative_to(ROOT)}: {path}#{anchor}")
+    assert len(pages) > 12
+    assert broken == []
 
 
 def _read(page: str) -> str:

@@ -31,8 +31,6 @@ from recorded_results import record, runs
 from vlagents_ray.policies.scripted import Scripted
 
 README = next(page for page in PAGES if page.name == "README.md")
-# The commands on the generated page come from the help, which cli/test_examples.py tests.
-WRITTEN = [page for page in PAGES if page.name != "cli.md"]
 BLOCKS = [(page, block) for page in PAGES for block in blocks(page.read_text())]
 RUN_HERE = [
     (page, block)
@@ -149,7 +147,7 @@ def as_it_stands(line: str) -> bool:
 
 def test_a_command_in_a_sentence_is_run_or_said_not_to_be() -> None:
     in_sentences = set()
-    for page in WRITTEN:
+    for page in PAGES:
         for line, in_block in commands(page.read_text()):
             if not in_block and as_it_stands(line):
                 in_sentences.add(line)
@@ -157,7 +155,7 @@ def test_a_command_in_a_sentence_is_run_or_said_not_to_be() -> None:
 
 
 def test_no_command_stands_in_a_block_that_nobody_runs() -> None:
-    for page in WRITTEN:
+    for page in PAGES:
         fences = re.findall(r"^ *```(\w*)\n(.*?)```", page.read_text(), re.DOTALL | re.MULTILINE)
         others = "".join(code for language, code in fences if language not in SHELL)
         assert not re.search(

@@ -1,5 +1,5 @@
-"""docs/programs.md lists the tested third-party programs with their versions; `tables` compares its
-text.
+"""The recorded outcomes of the tests of third-party programs, which the site shows in
+docs/programs.md.
 """
 
 from __future__ import annotations

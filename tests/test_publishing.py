@@ -110,46 +110,55 @@ def test_a_version_is_released_once_its_changelog_has_a_date() -> None:
     assert f"## [{release.VERSION}]" in problem
 
 
-def test_the_table_of_extras_has_a_row_of_each_and_is_of_their_present_requirements() -> None:
-    page = resolved.PAGE.read_text()
-    rows = [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in resolved.rows(page).values()
-    ]
-    assert list(resolved.rows(page)) == [extra or "none" for extra in resolved.extras()]
-    for _, *counts, built in rows:
-        assert len(counts) == len(resolved.PYTHONS)
+def test_the_packages_of_each_extra_are_recorded_for_its_present_requirements() -> None:
+    notes = resolved.notes()
+    assert list(notes) == [extra or "none" for extra in resolved.extras()]
+    for found in notes.values():
+        assert tuple(found["packages"]) == resolved.PYTHONS
+        counts = found["packages"].values()
         assert all(re.fullmatch(r"\d+\*?|no", count) for count in counts)
-        assert any("*" in count for count in counts) == bool(built)
-    assert resolved.digest() in page, "run `make extras`"
+        assert any("*" in count for count in counts) == bool(found["compiled"])
+    old = []
+    for extra in resolved.extras():
+        name = extra or "none"
+        if resolved.digest(extra) != notes[name]["digest"]:
+            old.append(name)
+    assert old == [], f"run `make extras ONLY='{' '.join(old)}'`"
 
 
-def test_rows_that_are_not_named_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        resolved, "cell", lambda _, python: ("7*", ["`a`"]) if python == "3.13" else ("6", [])
-    )
-    old = resolved.rows(resolved.PAGE.read_text())
-    new = resolved.table(["record"], old).splitlines()
-    assert new[2:] == [*(old | {"record": "| `record` | 6 | 6 | 6 | 7* | `a` |"}).values()]
-    assert len(new) == 2 + len(old)
-
-
-def test_a_changed_requirement_or_torch_makes_the_table_old(
+def test_extras_that_are_not_named_stay_as_they_are(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    before = resolved.digest()
-    monkeypatch.setitem(resolved.EXTRAS, "check", [])
-    assert resolved.digest() == before  # packages for developers are not part of it
+    monkeypatch.setattr(
+        resolved, "packages", lambda _, python: ("7*", ["a"]) if python == "3.13" else ("6", [])
+    )
+    before = resolved.notes()
+    after = resolved.resolved_extras(["record"])
+    counts = {"3.10": "6", "3.11": "6", "3.12": "6", "3.13": "7*"}
+    digest = resolved.digest("record")
+    record = {"digest": digest, "packages": counts, "compiled": ["a"]}
+    assert after == before | {"record": record}
+    monkeypatch.setattr(resolved, "NOTED", tmp_path / "extras.json")
+    resolved.write_extras(after)
+    assert resolved.notes() == after
+
+
+def test_a_changed_requirement_or_torch_makes_the_packages_old(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    before = {extra: resolved.digest(extra) for extra in resolved.extras()}
     (tmp_path / "torch.txt").write_text("torch==9.0\n")
     with monkeypatch.context() as patch:
         patch.setattr(resolved, "TORCH", tmp_path / "torch.txt")
-        assert resolved.digest() != before
+        assert all(resolved.digest(extra) != digest for extra, digest in before.items())
     monkeypatch.setitem(resolved.EXTRAS, "record", ["av>=13"])
-    assert resolved.digest() != before
+    changed = {extra for extra, digest in before.items() if resolved.digest(extra) != digest}
+    assert "record" in changed
+    assert not changed & {None, "serve", "limits"}
 
 
-def test_the_digest_of_the_table_is_the_same_in_each_process() -> None:
-    command = [sys.executable, "-c", "import resolved; print(resolved.digest())"]
+def test_the_digest_of_an_extra_is_the_same_in_each_process() -> None:
+    command = [sys.executable, "-c", "import resolved; print(resolved.digest('maniskill'))"]
     digests = set()
     for seed in range(4):  # hash seeds, which determine the order of sets of texts
         env = {

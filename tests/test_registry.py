@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import tables
 import tomllib
+from reference import folder_of
 
 import vlagents_ray
 from vlagents_ray import registry
@@ -210,9 +210,7 @@ def test_the_extras_and_files_that_cures_name_exist() -> None:
     assert set(registry._EXTRAS.keys()) <= extras.keys()
     registered = (registry.entries("policies") | registry.entries("envs")).values()
     for entry in registered:
-        project = tomllib.loads((ROOT / tables.folder_of(entry) / "pyproject.toml").read_text())[
-            "project"
-        ]
+        project = tomllib.loads((ROOT / folder_of(entry) / "pyproject.toml").read_text())["project"]
         assert entry.extra is None or entry.extra in project["optional-dependencies"]
     assert {
         one.requirements[0] for one in registry.entries("policies").values() if one.requirements

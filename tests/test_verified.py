@@ -1,6 +1,4 @@
-"""docs/policies/verification.md contains exactly the properties that the tests of model families
-verify.
-"""
+"""The outcomes of the tests of model families, and their table in docs/policies/verification.md."""
 
 from __future__ import annotations
 
@@ -11,15 +9,10 @@ from types import ModuleType
 
 import pytest
 import verified
-from tables import page_of
+from generated import page_of, verification
+from readme_blocks import DOCS
 
 from vlagents_ray.registry import entries
-
-
-@pytest.mark.slow
-def test_the_page_has_the_tests_that_there_are_with_what_became_of_them() -> None:
-    page = verified.PAGE.read_text()
-    assert verified.with_table(page) == page, "run `python tests/support/verified.py`"
 
 
 @pytest.mark.parametrize("family", verified.RUN_WITH)
@@ -39,14 +32,13 @@ def test_what_is_noted_is_of_tests_that_there_are(family: str) -> None:
 
 
 def test_each_page_of_a_family_links_to_what_is_verified_of_it() -> None:
-    of_families = {verified.page_of(family).partition("#")[0] for family in verified.RUN_WITH}
-    others = {
-        page_of(name, entry)
-        for name, entry in entries("policies").items()
-        if not entry.requirements
+    policies = entries("policies")
+    of_families = {
+        page_of(name, policies[name]) if name in policies else name for name in verified.RUN_WITH
     }
-    pages = {page.stem: page.read_text() for page in verified.PAGES.glob("*.md")}
-    assert of_families == set(pages) - others - {"index", verified.PAGE.stem}
+    others = {page_of(name, entry) for name, entry in policies.items() if not entry.requirements}
+    pages = {page.stem: page.read_text() for page in (DOCS / "policies").glob("*.md")}
+    assert of_families == set(pages) - others - {"index", "verification"}
     assert all("](verification.md)" in pages[name] for name in of_families)
 
 
@@ -77,7 +69,7 @@ def test_a_test_that_is_new_or_gone_changes_the_table(
     (file.parent / "test_more.py").write_text(
         '@pytest.mark.verifies("parity")\ndef test_more(): ...\n'
     )
-    table = verified.table()
+    table = "\n".join(verification())
     assert (
         "| [`pi0`](pi0.md) | 2, 1 skipped |  |  |  |  | Python 3.11, torch 2, on a CPU |" in table
     )
@@ -85,7 +77,7 @@ def test_a_test_that_is_new_or_gone_changes_the_table(
     assert "- `pi0`, Python 3.11, `test_more.py`: no simulator." in table
     file.write_text(file.read_text().replace("acts_are_theirs", "acts_are_like_theirs"))
     newer = "- `pi0`, Python 3.11, `test_it.py`: tests that are newer than these results."
-    assert newer in verified.table()
+    assert newer in "\n".join(verification())
 
 
 def test_outcomes_are_noted_by_family_and_test(

@@ -7,7 +7,7 @@ entries through the entry-point groups `vlagents_ray.policies`, `.wrappers`, `.e
 names a `RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a deployment
 file works without registration. Wrappers change the observations of any policy, or its actions.
 
-The tables of README and docs/ are made from these entries: `python tests/support/tables.py`.
+The tables of README and docs/ are made from these entries.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from tables import section
+from readme_blocks import section
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from generated import RATES
 from in_process_replicas import Replicas
 from quadrotor import Hover, HoverBatch, Quadrotors
 from raptor import Raptor
 from raptor_flights import TOLERANCE, fly, loaded, observation, reference, session, together
-from tables import RATES
 
 from vlagents_ray import Act, Agent, ConnectionLost
 from vlagents_ray.evaluate import EvalConfig, evaluate

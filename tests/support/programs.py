@@ -1,8 +1,8 @@
-"""Third-party programs and the outcomes of their tests; `tables` writes them into docs/programs.md.
+"""Third-party programs and the outcomes of their tests; the site shows them in docs/programs.md.
 
-A test that runs a program is marked `@pytest.mark.program(NAME)` with a name in `PROGRAMS`. `pytest
---verified` records the outcomes and the versions in `programs.json`. `make programs` runs the tests
-and writes the tables.
+A test that runs a program is marked `@pytest.mark.program(NAME)` with a name in `PROGRAMS`. `make
+programs` runs these tests with `pytest --verified`, which records the outcomes and the versions in
+`programs.json`.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ import json
 import os
 import platform
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import distributions
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pytest
 from verified import ROOT, installed_version
+
+if TYPE_CHECKING:
+    import pytest  # the environment that builds the site has none
 
 NOTED = ROOT / "tests" / "programs.json"
 PYPI = "PyPI"
@@ -253,20 +255,6 @@ PROGRAMS = {
         dialects={"openpi": {"mapping": "openpi-libero"}},
     ),
 }
-# Programs with other protocols: each protocol, and the size of a dialect for it, estimated from the
-# existing dialects.
-OTHERS = {
-    "positronic 0.4.1, `RemotePolicy`": (
-        "sessions over WebSocket and gRPC (`/api/v1/session`): about 350 lines"
-    ),
-    "inspect-robots-xpolicylab 0.1.0": "XPolicyLab's frames: about 250 lines",
-    "strands-robots 0.5.3, `RemotePolicy`": "JSON over WebSocket: about 250 lines",
-    "atoms-robot 0.1.0": (
-        "`POST /v1/act` with JPEG in base64, at a path of this project: about 100 lines, and a port"
-    ),
-    "roboeval 0.1.1": "HTTP with a handshake that states formats of actions: about 150 lines",
-    "agi-diy 0.5.12": "leases of a hosted service with accounts: no dialect",
-}
 
 
 class RunPrograms:
@@ -340,47 +328,3 @@ def _installed(name: str) -> str:
 
 def _python(program: Program) -> str:
     return program.python if program.requirements else ".".join(platform.python_version_tuple()[:2])
-
-
-def ran() -> Iterator[str]:
-    """Yield the rows of the table of programs, one for each Python with which a program was
-    tested.
-    """
-    yield from (
-        "| program | versions | from | connects to | tests | advice |",
-        "|---|---|---|---|---|---|",
-    )
-    noted = notes()
-    for name, program in PROGRAMS.items():
-        for one in noted.get(name, {"": {}}).values():
-            outcomes = ", ".join(
-                f"{one[what]} {what}" for what in ("passed", "failed", "skipped") if what in one
-            )
-            cells = (
-                name,
-                one.get("versions", ""),
-                program.source,
-                program.connects,
-                outcomes or "not run",
-            )
-            yield f"| {' | '.join((*cells, program.said))} |"
-
-
-def settings() -> Iterator[str]:
-    """Yield YAML blocks with the dialects of each program's server."""
-    import yaml  # the small environments of some families lack yaml
-
-    yield "```yaml"
-    for name, program in PROGRAMS.items():
-        if program.dialects:
-            yield f"# {name}"
-            yield yaml.safe_dump(
-                dict(program.dialects), sort_keys=False, default_flow_style=None, width=110
-            ).rstrip()
-    yield "```"
-
-
-def others() -> Iterator[str]:
-    """Yield the rows of the table of programs that would need another dialect."""
-    yield from ("| program | protocol, and the size of a dialect |", "|---|---|")
-    yield from (f"| {name} | {what} |" for name, what in OTHERS.items())

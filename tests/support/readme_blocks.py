@@ -264,6 +264,20 @@ COMMAND: Any = get_command(app)  # the main command, as a click command made by 
 PAGES = sorted([ROOT / "README.md", ROOT / "SECURITY.md", *DOCS.rglob("*.md")])
 
 
+def section(folder: str, page: str) -> str:
+    """Return the text of a page of docs/, given as `page` or, for one section of it, as
+    `page#anchor`.
+    """
+    name, _, anchor = page.partition("#")
+    text = (DOCS / folder / f"{name}.md").read_text()
+    if not anchor:
+        return text
+    for part in re.split(r"^(?=## )", text, flags=re.MULTILINE):
+        if re.sub(r"[^\w-]", "", part.partition("\n")[0][3:].lower().replace(" ", "-")) == anchor:
+            return part
+    raise ValueError(f"docs/{folder}/{name}.md: got no heading of the second level for #{anchor}")
+
+
 def commands(text: str) -> list[tuple[str, bool]]:
     """Return the commands of `vlagents-ray` in a page. The flag is true for a complete command in a
     block, and false for a command in a sentence.

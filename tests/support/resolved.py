@@ -1,8 +1,8 @@
 """Resolve the requirements of pyproject.toml and of the plug-ins with uv, for the table in
 docs/install.md and for the images' lock files.
 
-`python tests/support/resolved.py extras` updates the table, and `… locks` the lock files. Both need
-the network.
+`python tests/support/resolved.py extras` writes tests/extras.json, which the site shows as that
+table, and `… locks` the lock files. Both need the network.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import tomllib
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "install.md"
+NOTED = ROOT / "tests" / "extras.json"
 LOCKS = ROOT / "cluster" / "docker" / "locks"
 TORCH = ROOT / "cluster" / "docker" / "torch.txt"
 # RoboCasa needs 10 GB in addition to its packages, and CALVIN a checkout.
@@ -46,7 +46,6 @@ EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"] | OF_PLUGINS
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 SERVER_PYTHON = "3.11"  # Python of the servers in the images
 PLATFORM = "x86_64-manylinux_2_36"  # the platform of Debian bookworm
-BEGIN, END = "<!-- resolved {} -->", "<!-- /resolved -->"
 
 
 def direct(extra: str | None) -> list[str]:
@@ -114,74 +113,72 @@ def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[
     return list(tomllib.loads(done.stdout)["packages"])
 
 
-# The table in docs/install.md.
+# The packages of each extra.
 
 
 def extras() -> list[str | None]:
-    """Return the extras with a row in the table; None is the install without an extra."""
+    """Return the extras, and None for the install without an extra."""
     return [None, *(extra for extra in EXTRAS if extra not in OF_DEVELOPMENT)]
 
 
-def digest() -> str:
-    """Return a digest of everything in this repository on which the table depends."""
-    wanted = [PYTHONS, {str(extra): direct(extra) for extra in extras()}, lines(TORCH)]
+def digest(extra: str | None) -> str:
+    """Return a digest of everything in this repository on which the packages of an extra depend."""
+    wanted = [PYTHONS, direct(extra), lines(TORCH)]
     return hashlib.sha256(json.dumps(wanted).encode()).hexdigest()[:16]
 
 
-def cell(extra: str | None, python: str) -> tuple[str, list[str]]:
+def packages(extra: str | None, python: str) -> tuple[str, list[str]]:
     """Return the number of packages, and those that must be compiled if wheels alone do not
     suffice.
     """
     found, built = "no", list[str]()
     for words in ([], ["--no-build"]):
         with suppress(LookupError):
-            packages = resolve(direct(extra), python, *words)
-            built = [f"`{package['name']}`" for package in packages if not package.get("wheels")]
-            found = f"{len(packages)}*" if built else str(len(packages))
+            needed = resolve(direct(extra), python, *words)
+            built = [package["name"] for package in needed if not package.get("wheels")]
+            found = f"{len(needed)}*" if built else str(len(needed))
             if not built:
                 break
     return found, built
 
 
-def table(only: Sequence[str], old: dict[str, str]) -> str:
-    """Return the table. The rows in `only` are resolved again, or all rows if it is empty; `old`
-    has the other rows.
+def notes() -> dict[str, dict[str, Any]]:
+    """Return the recorded packages of each extra, and of "none": `digest`, `packages`, their number
+    for each Python, and `compiled`. A star marks a number that includes compiled packages.
+    """
+    found: dict[str, dict[str, Any]] = json.loads(NOTED.read_text())
+    return found
+
+
+def resolved_extras(only: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return what `notes` returns, with the extras in `only` resolved again, or all extras if it is
+    empty.
     """
     with ThreadPoolExecutor(8) as pool:
-        cells = {
-            extra or "none": [pool.submit(cell, extra, python) for python in PYTHONS]
+        futures = {
+            extra or "none": [pool.submit(packages, extra, python) for python in PYTHONS]
             for extra in extras()
             if not only or (extra or "none") in only
         }
-    heads = ["extra", *(f"Python {python}" for python in PYTHONS), "* compiled"]
-    found = [row(*heads), row(*["---"] * len(heads))]
+    found = {}
     for extra in extras():
         name = extra or "none"
-        if name not in cells:
-            found.append(old[name])
+        if name not in futures:
+            found[name] = notes()[name]
             continue
-        counts, built = zip(*(one.result() for one in cells[name]), strict=True)
-        found.append(
-            row(f"`{extra}`" if extra else name, *counts, ", ".join(sorted(set().union(*built))))
-        )
-    return "\n".join(found)
+        counts, built = zip(*(future.result() for future in futures[name]), strict=True)
+        found[name] = {
+            "digest": digest(extra),
+            "packages": dict(zip(PYTHONS, counts, strict=True)),
+            "compiled": sorted(set().union(*built)),
+        }
+    return found
 
 
-def row(*texts: str) -> str:
-    return "| " + " | ".join(texts).rstrip() + " |"
-
-
-def rows(page: str) -> dict[str, str]:
-    """Return the lines of the page's table by extra."""
-    return {line.split("|")[1].strip(" `"): line for line in written(page).splitlines()[3:-1]}
-
-
-def written(page: str) -> str:
-    """Return the table in the page, including the digest before it."""
-    found = re.search(f"{BEGIN.format('(.*)')}.*?{END}", page, re.DOTALL)
-    if found is None:
-        raise ValueError(f"{PAGE} has no {BEGIN.format('DIGEST')} … {END}")
-    return found[0]
+def write_extras(found: dict[str, dict[str, Any]]) -> None:
+    """Write the packages of all extras, a line for each."""
+    rows = ",\n".join(f"  {json.dumps(name)}: {json.dumps(row)}" for name, row in found.items())
+    NOTED.write_text(f"{{\n{rows}\n}}\n")
 
 
 # The lock files of the images.
@@ -241,9 +238,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     if arguments.what == "extras":
-        found = f"{BEGIN.format(digest())}\n{table(arguments.only, rows(PAGE.read_text()))}\n{END}"
-        page = PAGE.read_text()
-        PAGE.write_text(page.replace(written(page), found))
+        write_extras(resolved_extras(arguments.only))
         return
     wanted = arguments.only or list(locks())
     with ThreadPoolExecutor(8) as pool:

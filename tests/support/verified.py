@@ -1,10 +1,10 @@
-"""Write the table of docs/policies/verification.md, with the properties that the tests of the model
-families verify: `python tests/support/verified.py`.
+"""The properties that the tests of the model families verify, and the outcomes of these tests.
 
-A test declares with `@pytest.mark.verifies("parity")` which property it verifies. `pytest
---verified tests/families/FAMILY` records the outcomes of these tests in `verified.json` of that
-folder, and `make verified` does both. The reason for a skipped test comes from its report; the
-reason for an excluded file from `LEFT_OUT` of the folder's conftest.py, {file: reason}.
+A test declares with `@pytest.mark.verifies("parity")` which property it verifies. `make verified`
+runs `pytest --verified tests/families/FAMILY`, which records the outcomes of these tests in
+`verified.json` of that folder. The site shows them in docs/policies/verification.md. The reason for
+a skipped test comes from its report; the reason for an excluded file from `LEFT_OUT` of the
+folder's conftest.py, {file: reason}.
 """
 
 from __future__ import annotations
@@ -13,31 +13,26 @@ import ast
 import json
 import os
 import platform
-import re
 import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pytest
+from vlagents_ray.registry import entries
 
-from vlagents_ray.registry import entries, find_entry
+if TYPE_CHECKING:
+    import pytest  # the environment that builds the site has none
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = tuple(
     str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("plugins/*/tests/families"))
 )
-PAGES = ROOT / "docs" / "policies"
-PAGE = PAGES / "verification.md"
 PYTHON = "3.11"  # Python of this project's own environment
-BEGIN, END = "<!-- verified -->", "<!-- /verified -->"
 # The properties, which the page explains and which are its columns.
 WHAT = ("parity", "batches", "isolation", "loading", "size")
-PLUGINS = ("arro",)  # wrappers of packages in plugins/ that have a page among the policies' pages
-FURTHER_PAGES = (*PLUGINS, PAGE.stem)  # pages that belong to no policy
 # For each family, the names of its requirements files, and the packages and checkouts whose
 # versions matter.
 RUN_WITH = {
@@ -128,94 +123,6 @@ def marked(family: str) -> Iterator[tuple[str, str]]:
                     yield f"{file.name}::{node.name}", ast.literal_eval(mark.args[0])
 
 
-def table() -> str:
-    """Return the table of all families, and the list of their tests that did not run, in
-    Markdown.
-    """
-    rows, not_run = list[str](), list[str]()
-    for family in RUN_WITH:
-        for results in [one for one in notes(family) if one["tests"]] or [None]:
-            rows.append(_row(family, results))
-            if results is not None:
-                not_run += _reasons(family, results)
-    return "\n".join(
-        [
-            f"| policy | {' | '.join(WHAT)} | versions |",
-            f"|---|{'---|' * len(WHAT)}---|",
-            *rows,
-            "",
-            "Tests that did not run:",
-            "",
-            *not_run,
-        ]
-    )
-
-
-def with_table(page: str) -> str:
-    """Return the text of the page with the table between the markers."""
-    if page.count(BEGIN) != 1:
-        raise ValueError(f"{PAGE.name}: expected {BEGIN} once, and {END} after its table")
-    return re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table()}\n{END}", page, flags=re.DOTALL)
-
-
-def page_of(family: str) -> str:
-    """Return the page of a family and the section, such as "pi0#openpi"."""
-    entry = find_entry("policies", family)
-    return (entry.page if entry else None) or family
-
-
-def main() -> None:
-    PAGE.write_text(with_table(PAGE.read_text()))
-
-
-def _row(family: str, results: dict[str, Any] | None) -> str:
-    """Return the row of a family for one Python version; without results, its tests have
-    not run.
-    """
-    file, hash_sign, section = page_of(family).partition("#")
-    link = f"[`{family}`]({file}.md{hash_sign}{section})"
-    if results is None:
-        return f"| {link} | {' | ' * len(WHAT)}not run |"
-    cells = []
-    for verified in WHAT:
-        names = [name for name, what in marked(family) if what == verified]
-        outcomes = sum((Counter(results["tests"].get(name, {})) for name in names), Counter[str]())
-        passed = outcomes.pop("passed", 0)
-        others = [f"{number} {outcome}" for outcome, number in sorted(outcomes.items())]
-        cells.append(", ".join([str(passed)] * bool(passed) + others))
-    return f"| {link} | {' | '.join(cells)} | {_environment_of(results)} |"
-
-
-def _environment_of(results: dict[str, Any]) -> str:
-    absent = ("not set", "not installed")
-    versions = [
-        f"{f'`{name}`' if name.isupper() else name} {number}"
-        for name, number in results["versions"].items()
-        if number not in absent
-    ]
-    return ", ".join([f"Python {results['python']}", *versions, "on " + results["device"]])
-
-
-def _reasons(family: str, results: dict[str, Any]) -> Iterator[str]:
-    """Yield a line for each reason why marked tests of a family were skipped or not run."""
-    files_by_reason: dict[str, list[str]] = {}
-    for name, _ in marked(family):
-        file = name.partition("::")[0]
-        if name not in results["tests"]:
-            reason = results.get("left_out", {}).get(
-                file, "tests that are newer than these results"
-            )
-        elif name in results.get("skipped", {}):
-            reason = results["skipped"][name]
-        else:
-            continue
-        files = files_by_reason.setdefault(reason, [])
-        if f"`{file}`" not in files:
-            files.append(f"`{file}`")
-    for reason, files in files_by_reason.items():
-        yield f"- `{family}`, Python {results['python']}, {', '.join(files)}: {reason}."
-
-
 def _python() -> str:
     return ".".join(platform.python_version_tuple()[:2])
 
@@ -242,7 +149,3 @@ def _environment(family: str) -> dict[str, Any]:
         torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else "a CPU"
     )
     return {"python": _python(), "versions": versions, "device": device}
-
-
-if __name__ == "__main__":
-    main()

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import pytest
+from generated import RATES
 from in_process_replicas import Replicas
-from tables import RATES
 
 from vlagents_ray import Act, Obs
 from vlagents_ray.serve.models.agent_copies import AgentCopies
