@@ -3,7 +3,7 @@ success.
 
 The reference policy runs the same seeds of the tabletop with each setting: eager and without Ray,
 which is the standard; compiled, in bfloat16, in 8 bits; in batches; over each transport; with JPEG;
-with each mode of executing chunks, at several delays; with merged and separate LoRA; after a push;
+with each mode of executing chunks, at several delays; with a LoRA adapter; after a push;
 behind `upstream` with each protocol. A paired test (McNemar, adjusted by Holm for all settings)
 compares each setting with the standard. The actions of each episode are also compared bit by bit.
 """
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,10 +33,10 @@ from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval,
 from vlagents_ray.images.codecs import ImageCodec
 from vlagents_ray.interface import Agent
 from vlagents_ray.naming import plain
-from vlagents_ray.policies.adapters import CONFIG as ADAPTER_CONFIG
-from vlagents_ray.policies.adapters import WEIGHTS as ADAPTER_WEIGHTS
+from vlagents_ray.policies.base.adapter import CONFIG as ADAPTER_CONFIG
+from vlagents_ray.policies.base.adapter import WEIGHTS as ADAPTER_WEIGHTS
 from vlagents_ray.policies.reference import Reference
-from vlagents_ray.policies.reference.checkpoint import CONFIG, WEIGHTS
+from vlagents_ray.policies.reference.checkpoint import WEIGHTS
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.ports import free_port
@@ -104,8 +103,7 @@ class Way:
 
     name: str
     config: dict[str, Any] = field(default_factory=dict)  # settings of the policy
-    adapter: bool = False  # whether the adapter is loaded
-    merged: bool = False  # whether the checkpoint has the adapter merged into its weights
+    adapter: bool = False  # whether an adapter is merged into the weights
     transport: TransportName | None = None  # transport; None if the policy is in this process
     codec: ImageCodec = _RAW
     upstream: str | None = None  # protocol of the upstream
@@ -143,8 +141,7 @@ def ways() -> list[Way]:
             for name, settings in LATE.items()
             for s in DELAYS
         ),
-        Way("LoRA apart", adapter=True),
-        Way("LoRA merged", merged=True),
+        Way("LoRA adapter", adapter=True),
     ]
 
 
@@ -194,10 +191,7 @@ class Players:
             num_envs=way.together,
             clock=way.clock,
         )
-        options: dict[str, Any] = {"adapter": "own"} if way.adapter else {}
-        policy = PolicyConfig(
-            name=way.name, config=way.config, options=options, execute=way.execute
-        )
+        policy = PolicyConfig(name=way.name, config=way.config, execute=way.execute)
         place = self._folder / plain(way.name)
         plan = EvalConfig(
             policies=[policy], suites=[suite], out=place, video="none", workers=0, resume=True
@@ -232,9 +226,8 @@ class Players:
         return Upstream.from_config(config | {"mapping": mapping})
 
     def _config(self, way: Way) -> dict[str, Any]:
-        checkpoint = self._merged() if way.merged else self._checkpoint
-        adapters = {"adapters": {"own": str(self._adapter())}} if way.adapter else {}
-        return {"checkpoint": str(checkpoint), "embodiment": "tabletop"} | adapters | way.config
+        config = {"checkpoint": str(self._checkpoint), "embodiment": "tabletop"} | way.config
+        return config | ({"adapter": str(self._adapter())} if way.adapter else {})
 
     def _serve(self) -> tuple[str, dict[str, int]]:
         if self._server is None:
@@ -291,16 +284,6 @@ class Players:
                 file,
                 {f"base_model.model.{_ADAPTED}.lora_{name}.weight": value for name, value in named},
             )
-        return folder
-
-    def _merged(self) -> Path:
-        folder = self._folder / "merged"
-        folder.mkdir(parents=True, exist_ok=True)
-        shutil.copy(self._checkpoint / CONFIG, folder)
-        (down, up), values = self._low_rank(), self._weights()
-        values[f"{_ADAPTED}.weight"] += up @ down
-        with (folder / WEIGHTS).open("wb") as file:
-            write_values(file, values)
         return folder
 
 

@@ -243,8 +243,7 @@ class HasWeightsId(Protocol):
     """The policy identifies its weights, for weights that are not loaded from checkpoint files."""
 
     weights_id: dict[str, Any] | None
-    """{"digest": …, "revision": …}, which identify the weights that `initialize` loaded, and
-    further entries for the server's metadata.
+    """{"digest": …, "revision": …}, which identify the weights that `initialize` loaded.
 
     A server reports the digest and the revision, and an evaluation does not mix results with
     different digests. If a policy lacks this attribute, the digest is computed from the files that

@@ -18,8 +18,8 @@ class Misled(Reference):
     colour, or the task with another task.
     """
 
-    def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
+    def _begin(self, instruction: str, seed: int) -> None:
         other = _DEEDS.get(instruction) or " ".join(
             _COLOURS.get(word, word) for word in instruction.split()
         )
-        super()._begin(other, seed, adapter)
+        super()._begin(other, seed)

@@ -1,6 +1,5 @@
-"""A policy with a small network whose layers LoRA adapters change. Deployments name it
-`adapted_network:Small`. Functions below write adapters with random values, in PEFT's format, and
-merge them into a network for comparison.
+"""A policy with a small network whose layers a LoRA adapter changes. Functions below write adapters
+with random values, in PEFT's format, and merge them into a network for comparison.
 """
 
 from __future__ import annotations
@@ -8,27 +7,25 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.weights.safetensors import header_of, parts_of
 
-HORIZON, DIM, VIEWS = 3, 4, 2
+HORIZON, DIM = 3, 4
 LAYERS = ("see", "look", "head.0", "head.2")
 
 
 class Small(ModelPolicy):
-    """A network that processes two views of a state, as numbers and as images, and adds noise."""
+    """A network that processes a state, as numbers and as an image, and adds noise."""
 
     Config = ModelConfig
-    adaptable = True
     trainable = network = "model"
-    passes: ClassVar[list[int]] = []  # number of rows in each forward pass
 
     @property
     def contract(self) -> Contract:
@@ -55,20 +52,13 @@ class Small(ModelPolicy):
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         import torch
 
-        self.passes.append(len(rows))
-        firsts, owners = shared_frames(rows)
-        states = torch.from_numpy(np.stack([rows[i].frames[-1] for i in firsts]))
+        states = torch.from_numpy(np.stack([row.frames[-1] for row in rows]))
+        noise = torch.from_numpy(np.stack([row.noise(8) for row in rows]))
         with torch.inference_mode():
-            with self.adapters.rows([rows[i].adapter for i in firsts]):
-                # Each observation has two entries.
-                views = torch.stack([states, -states], 1).flatten(0, 1)
-                image = torch.cat([views, -views, views**2], 1).view(-1, 3, 2, 2)
-                both = self.model["see"](views) + self.model["look"](image).mean((2, 3))
-                seen = torch.tanh(both).unflatten(0, (len(firsts), VIEWS)).mean(1)[owners]
-            noise = torch.from_numpy(np.stack([row.noise(8) for row in rows]))
-            with self.adapters.rows([row.adapter for row in rows]):
-                chunks = self.model["head"](seen + noise).unflatten(1, (HORIZON, DIM))
-        return [Prediction(chunk, info={"rows": len(rows)}) for chunk in chunks.numpy()]
+            image = torch.cat([states, -states, states**2], 1).view(-1, 3, 2, 2)
+            both = self.model["see"](states) + self.model["look"](image).mean((2, 3))
+            chunks = self.model["head"](torch.tanh(both) + noise).unflatten(1, (HORIZON, DIM))
+        return [Prediction(chunk) for chunk in chunks.numpy()]
 
 
 def base(tmp_path: Path) -> Path:

@@ -23,7 +23,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.policies.adapters import LoraAdapters
 from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import Row
 from vlagents_ray.policies.compilation import Compilation
@@ -330,7 +329,6 @@ class FlowPasses(abc.ABC):
     def __init__(self, model: Any, compilation: Compilation) -> None:
         """Create the forward passes of a model, compiled where possible."""
         self.model = model
-        self.adapters = LoraAdapters()  # the adapters of the policy
         # The module that defines the model, with the functions that its authors use in their
         # forward passes.
         self.module = sys.modules[type(model).__module__]
@@ -448,15 +446,7 @@ class FlowPasses(abc.ABC):
         if random is not None:
             changes.append(random.change)
 
-        fingerprints = [row.adapter for row in rows]
-        flow = self.sample(
-            *inputs,
-            noise=start,
-            owners=owners,
-            steps=steps,
-            changes=changes,
-            fingerprints=fingerprints if any(fingerprints) else (),
-        )
+        flow = self.sample(*inputs, noise=start, owners=owners, steps=steps, changes=changes)
         outputs = {} if random is None else random.outputs(config.execute, dim)
         return fetch(flow), outputs
 
@@ -472,7 +462,6 @@ class FlowPasses(abc.ABC):
         owners: Sequence[int],
         steps: int,
         changes: Sequence[Change] = (),
-        fingerprints: Sequence[str] = (),
         frozen: Any = None,
         states: Any = None,
         state_masks: Any = None,
@@ -489,7 +478,6 @@ class FlowPasses(abc.ABC):
             owners: The index of the observation of each row.
             steps: The number of steps of the flow.
             changes: See `follow`.
-            fingerprints: The adapter of each row, see `Row.adapter`; empty if no row has one.
             frozen: With `by_row`, 1.0 for the rows of chunks that are already actions, at flow time
                 0, and 0.0 for other rows, (B, H, 1).
             states: The states of a memory, an argument that LeRobot's π0.5 passes since 0.6.1. It
@@ -497,27 +485,19 @@ class FlowPasses(abc.ABC):
             state_masks: As `states`.
         """
         torch = require("torch")
-        observations = len(mask)
-        # An observation is encoded with the adapter of its first row.
-        encoding_adapters: list[str] = []
-        if fingerprints:
-            first_rows = [list(owners).index(owner) for owner in range(observations)]
-            encoding_adapters = [fingerprints[row] for row in first_rows]
         if state is None:
             state = mask[:, :0].float()
-        with self.adapters.rows(encoding_adapters):
-            encoded, present = self._encode(
-                tokens, mask, torch.stack(list(cameras), 1), state, *self.encode_images(images)
-            )
+        encoded, present = self._encode(
+            tokens, mask, torch.stack(list(cameras), 1), state, *self.encode_images(images)
+        )
 
-        if list(owners) != list(range(observations)):
+        if list(owners) != list(range(len(mask))):
             index = torch.tensor(owners).to(mask.device, non_blocking=True)
             encoded, present, state = encoded[index], present[index], state[index]
 
         changed = partial(self._flow, steps, changes, frozen)
         flow = changed if changes else self._whole_flow(steps)
-        with self.adapters.rows(fingerprints):
-            return flow(encoded, present, state, noise)
+        return flow(encoded, present, state, noise)
 
     def _whole_flow(self, steps: int) -> Callable[..., Any]:
         """Return the core of the whole flow, without changes of the velocity."""

@@ -56,8 +56,7 @@ class GemmaLayers:
         The parameters become views of one tensor for each product, with the names, shapes and
         values that they had. Pushed weights on a GPU are copied into the memory of the parameters,
         and therefore also change the merged tensor. On a CPU, pushed weights replace the
-        parameters, so no weights may be pushed after this call. Layers must have no adapters, and
-        must not be quantized.
+        parameters, so no weights may be pushed after this call. Layers must not be quantized.
         """
         for layer in self.model.layers:
             attention, mlp = layer.self_attn, layer.mlp

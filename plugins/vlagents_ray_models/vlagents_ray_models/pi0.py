@@ -22,6 +22,7 @@ from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
+from vlagents_ray.policies.base.adapter import LoraAdapter
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.model_inputs import (
@@ -119,7 +120,6 @@ class Pi0(ModelPolicy):
 
     Config: ClassVar[type] = Pi0Config
     trainable = network = "model.network"
-    adaptable = True
     config: Pi0Config
     model: LoadedPi0 | None
 
@@ -167,39 +167,14 @@ class Pi0(ModelPolicy):
         network = from_pretrained(model_class, path, dtype=dtype)
         network = network.eval().requires_grad_(False).to(device)
         passes = Pi0HfPasses(network, self.compilation, self.config.attention)
-        passes.adapters = self.adapters
 
-        processor, staging = _processor(path), Staging(device)
+        processor, staging = _processor(path, self.adapter), Staging(device)
         style = self._style(processor)
         logger.info("images and instructions are prepared as in %s; `images` changes that", style)
         return LoadedPi0(network, processor, dtype, passes, staging, _scale(processor, staging))
 
     def merge_products(self) -> None:
         self.loaded().passes.merge_products()
-
-    def adapt(self, adapter: str, folder: Path) -> None:
-        """Check that an adapter's folder has no statistics, or the same statistics as the base.
-
-        Raises:
-            ConfigError: The adapter's statistics differ from the base's.
-        """
-        file = folder / _PROCESSOR
-        if not file.is_file():
-            return
-        try:
-            saved = dict(json.loads(file.read_text(encoding="utf-8")))
-        except (TypeError, ValueError) as error:
-            raise ConfigError(
-                f"{file}: is no processor's config ({error}); copy it again"
-            ) from error
-
-        base = {name: list(getattr(self.loaded().processor, name)) for name in _STATISTICS}
-        different = [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]
-        if different:
-            raise ConfigError(
-                f"{file}: expected {different} as the base has, got others; merge the adapter "
-                "into its base, and serve that as a checkpoint of its own"
-            )
 
     def perceive(self, obs: Obs) -> StagedRow:
         """Return the model's inputs for one row: resized images, normalised state, and the
@@ -260,14 +235,14 @@ class Pi0(ModelPolicy):
             padded[i, :rows, :columns] = np.moveaxis(resized, 0, -1)
         return {"images": padded, "sizes": sizes}
 
-    def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
+    def _begin(self, instruction: str, seed: int) -> None:
         """Begin an episode and tokenize its instruction.
 
         Raises:
             InvalidObservation: The instruction is longer than in training, or contains the token of
                 an image. It is never truncated.
         """
-        super()._begin(instruction, seed, adapter)
+        super()._begin(instruction, seed)
         if self.model is None:
             return
 
@@ -372,12 +347,24 @@ def _openpi_text(instruction: str) -> str:
     return instruction.strip().replace("_", " ").replace("\n", " ")
 
 
-def _processor(path: Path) -> Any:
-    """Load the processor of a checkpoint.
+def _processor(path: Path, adapter: LoraAdapter | None) -> Any:
+    """Load the processor of a checkpoint, with the statistics in its adapter's folder, if any.
 
     Raise `ConfigError` if the processor has no statistics.
     """
     processor = require("transformers").PI0Processor.from_pretrained(path, local_files_only=True)
+    if adapter is not None and (adapter.folder / _PROCESSOR).is_file():
+        file = adapter.folder / _PROCESSOR
+        try:
+            saved = dict(json.loads(file.read_text(encoding="utf-8")))
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                f"{file}: is no processor's config ({error}); copy it again"
+            ) from error
+        for name in _STATISTICS:
+            if saved.get(name) is not None:
+                setattr(processor, name, saved[name])
+
     absent = [name for name in _STATISTICS if getattr(processor, name) is None]
     if absent:
         raise ConfigError(

@@ -65,8 +65,7 @@ class Pi0Passes(FlowPasses):
         """
         import torch  # torch's compiler follows this statement, but not `require`
 
-        # One call encodes the images of all cameras. The images of a row are adjacent, as adapters
-        # expect.
+        # One call encodes the images of all cameras.
         pixels = torch.stack(images, 1)
         features = self._embed_image(pixels.flatten(0, 1)).unflatten(0, pixels.shape[:2])
         embedded, present, _ = self.model.embed_prefix(

@@ -18,9 +18,9 @@ import pytest
 from empty_hub import empty_hub
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.base.adapter import LoraAdapter
 from vlagents_ray.policies.base.checkpoint import (
     SavedTensors,
-    find_adapter,
     find_checkpoint,
     require_filled,
     require_loaded,
@@ -329,5 +329,5 @@ NAMED = f"org/name@{COMMIT}"
 def test_an_adapter_is_asked_for_by_its_commit(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = empty_hub(monkeypatch)
     with pytest.raises(ConfigError, match="nor available from the hub"):
-        find_adapter(NAMED, "org/base", [], "")
+        LoraAdapter.find(NAMED)
     assert asked == [("org/name", COMMIT)]

@@ -880,13 +880,3 @@ def test_graphs_alone_are_for_gpus(cuda: FakeCuda) -> None:
         ConfigError, match="compile: graphs: expected a model on 'cuda', got one on 'cpu'"
     ):
         OnCpu.from_config({"checkpoint": "none", "compile": "graphs"}).initialize()
-
-
-def test_adapters_leave_nothing_to_compile_and_8_bits_do() -> None:
-    assert ModelConfig(checkpoint="none", quantization="int8").compile_on("cuda") == "graphs"
-    assert ModelConfig(checkpoint="none", adapters={"a": "b"}).compile_on("cuda") is False
-    for mode in ("graphs", True, "require"):
-        with pytest.raises(
-            ValueError, match="adapters and compile: expected one of the two, got both"
-        ):
-            ModelConfig(checkpoint="none", adapters={"a": "b"}, compile=mode)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
-import os
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
@@ -15,14 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.adapters import DIGITS, FILES, LoraAdapter, base_of
-from vlagents_ray.policies.base.checkpoint_files import digest, revision
 from vlagents_ray.registry import require
 
 log = logging.getLogger(__name__)
 
 STEP = "{step}"  # the placeholder in a checkpoint's name
-_HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 _INDEX = ".safetensors.index.json"
 # Number of compared elements of each tensor, enough to distinguish trained weights from random
 # ones.
@@ -103,74 +97,6 @@ def _holds(folder: Path, path: Path) -> bool:
     # A file in the hub's cache is a link to a file outside of the link's folder.
     resolved = (path.resolve(), path.parent.resolve() / path.name)
     return any(folder.resolve() in (target, *target.parents) for target in resolved)
-
-
-def find_adapter(
-    source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str
-) -> tuple[LoraAdapter, Path]:
-    """Find a LoRA adapter.
-
-    Args:
-        source: The adapter's path or hub id.
-        checkpoint: The name of the policy's checkpoint, which is the base of the adapter.
-        base: The files and folders of the base.
-        digest_of_base: Their digest.
-
-    Returns:
-        The adapter, and its folder.
-
-    Raises:
-        ConfigError: The adapter is missing, or was trained on another base.
-    """
-    folder = find_checkpoint(source, needs=FILES)
-    if not folder.is_dir():
-        raise ConfigError(
-            f"{folder}: expected the folder with {', '.join(FILES)}, as PEFT saves it, got a file"
-        )
-
-    trained_on = base_of(folder)
-    if trained_on is not None and _is_other(trained_on, checkpoint, base, digest_of_base):
-        raise ConfigError(
-            f"{folder}: expected an adapter of {checkpoint!r}, the policy's checkpoint, got one "
-            f"trained on {trained_on!r}; if these are the same weights, write that name as "
-            "base_model_name_or_path in its adapter_config.json"
-        )
-
-    digest_of_adapter = digest([folder])
-    method = digest_of_adapter.partition(":")[0]
-    both = hashlib.sha256(f"{digest_of_base} {digest_of_adapter}".encode()).hexdigest()
-    adapter = LoraAdapter(
-        source=source,
-        weights=f"{method}:{both}",
-        fingerprint=both[:DIGITS],
-        revision=revision(folder),
-    )
-    return adapter, folder
-
-
-def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> bool:
-    """Return whether an adapter is known to have been trained on another base.
-
-    Args:
-        trained_on: The name of the base in the settings of the adapter.
-        checkpoint: The name of the policy's checkpoint.
-        base: The files and folders of that checkpoint.
-        digest_of_base: Their digest.
-    """
-    # Unlike the methods of Path, functions of os.path raise no error for unknown users or for
-    # unreadable folders.
-    path = Path(os.path.expanduser(trained_on))
-    if os.path.exists(path):
-        folders_of_base: set[Path] = set()
-        for base_path in base:
-            folders_of_base |= {base_path.resolve(), *base_path.resolve().parents}
-        return path.resolve() not in folders_of_base and digest([path]) != digest_of_base
-
-    names = [name.partition("@")[0] for name in (trained_on, checkpoint)]
-    if all(_HUB_ID.fullmatch(name) for name in names) and not Path(checkpoint).exists():
-        return names[0] != names[1]
-    log.warning("adapter: the names do not show whether its base %r is the checkpoint %r", *names)
-    return False
 
 
 def _beside(path: Path) -> str:

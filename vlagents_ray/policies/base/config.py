@@ -43,6 +43,12 @@ class ModelConfig(BaseModel, extra="forbid"):
     checkpoint_step: int | None = Field(
         default=None, ge=0, description="Training step that replaces `{step}`."
     )
+    adapter: str | None = Field(
+        default=None,
+        min_length=1,
+        description="LoRA adapter of the checkpoint that is merged into its weights: a folder of "
+        "PEFT, or a hub id (org/name, org/name@COMMIT). null: none.",
+    )
     device: str = Field(
         default="auto",
         description="Device: `cpu`, `cuda`, `cuda:1`, or `auto`, an accelerator if there is one.",
@@ -63,13 +69,6 @@ class ModelConfig(BaseModel, extra="forbid"):
         "`float8_dynamic` also computes their products in 8 bits, which needs `compile` true, max "
         "or require.",
     )
-    adapters: dict[str, str] = Field(
-        default={},
-        description=(
-            "LoRA adapters by name, as PEFT's folders or hub ids, that sessions may choose for the "
-            "checkpoint. The `checkpoints` of a deployment usually set them."
-        ),
-    )
     compile: CompileMode = Field(
         default="auto",
         description=(
@@ -78,7 +77,7 @@ class ModelConfig(BaseModel, extra="forbid"):
             "torch.compile alone. A part that cannot be compiled, or whose results differ, runs "
             "uncompiled. `max`: like true, but torch measures several kernels for each product, so "
             "that loading takes longer. `require`: like true, but such a part is an error. `auto`: "
-            "`graphs` on a GPU, and false on a CPU, with adapters, or if the family has no graphs."
+            "`graphs` on a GPU, and false on a CPU or if the family has no graphs."
         ),
     )
     seed: int = Field(
@@ -156,22 +155,6 @@ class ModelConfig(BaseModel, extra="forbid"):
         return self
 
     @model_validator(mode="after")
-    def _adapters_are_added_to_eager_whole_layers(self) -> Self:
-        if not self.adapters:
-            return self
-        is_set = {
-            "compile": self.compile not in (False, "auto"),
-            "quantization": self.quantization is not None,
-        }
-        for name, value in is_set.items():
-            if value:
-                raise ValueError(
-                    f"adapters and {name}: expected one of the two, got both; merge an adapter "
-                    f"into its base to use {name} with it"
-                )
-        return self
-
-    @model_validator(mode="after")
     def _products_in_8_bits_are_compiled(self) -> Self:
         if self.quantization == "float8_dynamic" and not uses_torch_compile(self.compile):
             raise ValueError(
@@ -192,7 +175,7 @@ class ModelConfig(BaseModel, extra="forbid"):
 
     def compile_on(self, device: str) -> CompileMode:
         """Return the setting `compile` for a kind of device, such as "cuda"; "auto" is resolved."""
-        graphs: CompileMode = "graphs" if device == "cuda" and not self.adapters else False
+        graphs: CompileMode = "graphs" if device == "cuda" else False
         return graphs if self.compile == "auto" else self.compile
 
     def with_sizes(self, sizes: Sequence[int]) -> Self:

@@ -48,9 +48,6 @@ class Row:
     # Whether the chunk is drawn from the distribution, which samples and requested outputs require.
     # Otherwise, the most likely chunk is computed.
     sample: bool = False
-    # The fingerprint of the session's adapter, empty without an adapter: see
-    # `ModelPolicy.adapters`.
-    adapter: str = ""
 
     def noise(self, *shape: int) -> np.ndarray:
         """Draw standard normal numbers, float32, which are the same on every device."""

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from operator import attrgetter
-from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -41,14 +40,14 @@ from vlagents_ray.interface import (
     Obs,
     TrainableAgent,
 )
-from vlagents_ray.policies.adapters import ADAPTER, DIGITS, LoraAdapters
 from vlagents_ray.policies.base.accelerator import (
     free_memory,
     gpu_timer,
     is_out_of_memory,
     set_matmul,
 )
-from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
+from vlagents_ray.policies.base.adapter import LoraAdapter
+from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_inputs import (
@@ -71,7 +70,6 @@ from vlagents_ray.policies.loading import (
 )
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.validation import check_action
-from vlagents_ray.weights.trainable import from_host, named_values, to_host
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +101,6 @@ class PolicyEpisode:
     draws: np.random.Generator  # generator of samples, so that requesting them changes no action
     plan: ChunkBuffer  # remaining actions, if they are returned one at a time
     memory: dict[str, Any] = field(default_factory=dict)
-    adapter: str = ""  # fingerprint of the adapter; empty without an adapter
     # The tokens of the instruction, for families that compute them when the episode begins.
     prompt: Any = None
 
@@ -117,25 +114,24 @@ class ModelPolicy(TrainableAgent, abc.ABC):
     of the episode.
     """
 
-    shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation", "adapters", "report")
-    # The name of the attribute with the network whose linear layers `quantization` may keep in 8
-    # bits.
+    shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation", "adapter", "report")
+    # The name of the attribute with the torch module into which `adapter` is merged, and whose
+    # linear layers `quantization` may keep in 8 bits.
     network: ClassVar[str | None] = None
-    # Whether `predict` runs `network` within `self.adapters.rows`.
-    adaptable: ClassVar[bool] = False
 
     def __init__(self, config: Any) -> None:
         self.config: ModelConfig = config
         self.model: Any = None
         # `load` passes the model's cores to it.
         self.compilation = Compilation(self.config.compile)
-        self.adapters = LoraAdapters()
+        # The adapter that the settings name, before `load` is called.
+        self.adapter: LoraAdapter | None = None
         # Replaced with the server's report when the model is loaded.
         self.report = LoadingReport(lambda _: None, COMPILED_SIZES)
         self.episode: PolicyEpisode | None = None
-        if self.config.adapters and not self.adaptable:
+        if self.config.adapter is not None and self.network is None:
             raise ConfigError(
-                f"adapters: {type(self).__name__} does not offer them; merge each into its base"
+                f"adapter: {type(self).__name__} does not accept one; merge it into its base"
             )
 
     def loaded(self) -> Any:
@@ -231,7 +227,7 @@ class ModelPolicy(TrainableAgent, abc.ABC):
 
         Their weights become views of one tensor. The method is called for a network on an
         accelerator, where pushed weights are copied into the memory of the old weights. It is not
-        called if the network is quantized or has adapters, which change single layers.
+        called if the network is quantized, which changes single layers.
         """
 
     def initialize(self) -> None:
@@ -242,7 +238,10 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         lack of memory is an error before a robot moves.
         """
         with current_report() as self.report:
-            self.model = self._load_with_adapters() if self.config.adapters else self.load()
+            if self.config.adapter is None:
+                self.model = self.load()
+            else:
+                self._load_with_adapter(self.config.adapter)
         for device in self.report.devices:
             set_matmul(self.config.matmul, device)
         self._decide_on_compiling()
@@ -255,7 +254,7 @@ class ModelPolicy(TrainableAgent, abc.ABC):
                     "true, or leave quantization out",
                     self.config.quantization,
                 )
-        elif self.report.accelerated and not self.config.adapters:
+        elif self.report.accelerated:
             self.merge_products()
         self._warm_up(defers=self.report.beside_acts)
 
@@ -329,11 +328,10 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         if self.config.compile == "auto":
             mode = mode if self.compilation.cores else False
             logger.info(
-                "compile: auto: %s, on %r, with %d cores and %d adapters",
+                "compile: auto: %s, on %r, with %d cores",
                 mode,
                 kind,
                 len(self.compilation.cores),
-                len(self.config.adapters),
             )
         elif mode == "graphs" and kind != "cuda":
             raise ConfigError(
@@ -345,20 +343,16 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             self.config = self.config.with_sizes(self.report.batch_sizes)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode.
-
-        The options are `seed`, an int (default 0), and `adapter`, the name of an adapter.
-        """
+        """Begin an episode; the option `seed` is an int (default 0)."""
         contract = self.contract
         if contract is not None and contract.instruction and not instruction:
             raise InvalidObservation(
                 "instruction: expected the robot's task in words, got an empty text; give one at "
                 "the reset"
             )
-        adapter = self.adapters.find(kwargs.get(ADAPTER))
-        self._begin(instruction or "", int(kwargs.get("seed") or 0), adapter.fingerprint)
+        self._begin(instruction or "", int(kwargs.get("seed") or 0))
         self.notice(obs)
-        return adapter.identity
+        return {}
 
     def notice(self, obs: Obs) -> None:
         """Update the session's memory from an observation.
@@ -405,21 +399,17 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         return answers
 
     def sleep(self) -> None:
-        """Free the captured graphs, and move the weights to the host if the policy has adapters."""
+        """Free the captured graphs."""
         self.compilation.drop_graphs()
-        if self.config.adapters:  # the server moves only the trainable values
-            to_host([named_values(attrgetter(self.network or "")(self))], self.adapters.moved)
 
     def wake(self) -> None:
-        """Move the weights back to the device, and capture the graphs again."""
-        from_host(self.adapters.moved)
+        """Capture the graphs again."""
         if self.compilation.mode and not self.compilation.sizes:
             self._warm_up()
 
     def close(self) -> None:
-        """Drop the model, its adapters and its compiled programs, so that their memory is freed."""
+        """Drop the model and its compiled programs, so that their memory is freed."""
         self.model = None
-        self.adapters = LoraAdapters()
         self.compilation = Compilation(self.config.compile)
 
     def _trainable(self) -> Any:
@@ -429,37 +419,20 @@ class ModelPolicy(TrainableAgent, abc.ABC):
                 f"quantization {quantization!r}: a learner cannot push to 8-bit weights; leave it "
                 "out"
             )
-        return self.adapters.trainable if self.config.adapters else super()._trainable()
+        return super()._trainable()
 
-    def adapt(self, adapter: str, folder: Path) -> None:
-        """Check the other files in an adapter's folder, and store the normalization statistics for
-        the adapter's rows.
-
-        Args:
-            adapter: The adapter's fingerprint, as in `Row.adapter`.
-            folder: The folder, from which the adapter itself has been read.
-
-        Raises:
-            ConfigError: The adapter has other inputs or actions than the base.
-        """
-
-    def _load_with_adapters(self) -> Any:
-        """Load the checkpoint and the adapters, and return the model."""
+    def _load_with_adapter(self, source: str) -> None:
+        """Load the checkpoint, and merge the adapter at `source` into its weights."""
+        with used_checkpoints():  # the adapter is not one of the files of the base
+            self.adapter = LoraAdapter.find(source)
         with used_checkpoints() as base:
             self.model = self.load()
-        weights = weights_of(base) or {}
-        digest = weights.get("digest") or ""
-        find = partial(
-            find_adapter, checkpoint=self.config.checkpoint, base=base, digest_of_base=digest
-        )
-        self.adapters.load(
-            attrgetter(self.network or "")(self), self.config.adapters, find, self.adapt
-        )
-        self.adapters.base = digest.rpartition(":")[2][:DIGITS]
-        self.weights_id = {**weights, "adapters": self.adapters.ids} if base else None
-        return self.model
 
-    def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
+        self.adapter.require_base(self.config.checkpoint, base)
+        self.adapter.merge_into(attrgetter(self.network or "")(self))
+        self.weights_id = weights_of([*base, self.adapter.folder]) if base else None
+
+    def _begin(self, instruction: str, seed: int) -> None:
         """Begin an episode in this session."""
         # Numpy accepts no negative seed. Modulo 2**64, distinct int64 values remain distinct.
         seeds = [self.config.seed, seed % 2**64]
@@ -469,7 +442,6 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             np.random.default_rng(seeds),
             np.random.default_rng([*seeds, 1]),
             ChunkBuffer(ENSEMBLE, self.config.ensemble_m),
-            adapter=adapter,
         )
 
     def _current_episode(self) -> PolicyEpisode:
@@ -513,7 +485,6 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             memory=episode.memory,
             want=want,
             sample=bool(want),
-            adapter=self.adapters.require(episode.adapter),
         )
         if not samples:
             return [chunk_row]
@@ -533,9 +504,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
                 the next action of the session's plan.
         """
         episode = session._current_episode()
-        info = self.adapters.weights_info(episode.adapter)
         if not predictions:
-            return Act(episode.plan.take().action, info=info)
+            return Act(episode.plan.take().action)
 
         computed: list[Prediction] = []
         for prediction in predictions:
@@ -545,7 +515,7 @@ class ModelPolicy(TrainableAgent, abc.ABC):
 
         chunk_prediction, *samples = computed
         chunk = self._executed_rows(chunk_prediction.actions)
-        info |= chunk_prediction.info
+        info = dict(chunk_prediction.info)
         if chunk_prediction.behaviour:
             info[BEHAVIOUR] = chunk_prediction.behaviour
         if samples:
@@ -748,9 +718,9 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         obs = Obs(cameras=images, gripper=gripper, state=state)
 
         session = copy.copy(self)
-        session._begin(instruction, seed, self.adapters.example(seed))
+        session._begin(instruction, seed)
         frames = (session.perceive(obs),) * self.history
-        return Row(frames, instruction, rng, adapter=self.adapters.example(seed))
+        return Row(frames, instruction, rng)
 
 
 def _stacked(mappings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

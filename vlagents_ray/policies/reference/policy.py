@@ -84,7 +84,6 @@ class Reference(ModelPolicy):
 
     Config: ClassVar[type] = ReferenceConfig
     trainable = network = "model.network"
-    adaptable = True
     config: ReferenceConfig
     model: LoadedReference | None
 
@@ -139,12 +138,11 @@ class Reference(ModelPolicy):
         network = read_network(checkpoint.sizes, folder)
         network = network.eval().requires_grad_(False).to(device, dtype)
         passes = ReferencePasses(network, self.compilation)
-        passes.adapters = self.adapters
         cameras = model_inputs.choose_cameras(self.config.cameras, robot.cameras, CAMERAS)
         return LoadedReference(network, checkpoint, robot, cameras, dtype, passes, Staging(device))
 
-    def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
-        super()._begin(instruction, seed, adapter)
+    def _begin(self, instruction: str, seed: int) -> None:
+        super()._begin(instruction, seed)
         if self.model is not None:
             self._current_episode().prompt = self.model.checkpoint.tokens(instruction)
 

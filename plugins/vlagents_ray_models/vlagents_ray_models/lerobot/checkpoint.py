@@ -190,9 +190,8 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     """
     if settings.use_peft:
         raise ConfigError(
-            "checkpoint: expected whole weights, got a PEFT adapter; merge it (merge_and_unload) "
-            "and save that, or serve its base with the adapter as one of the deployment's "
-            "`checkpoints`"
+            "checkpoint: expected whole weights, got a PEFT adapter; set `checkpoint` to its base "
+            "and `adapter` to this folder"
         )
 
     settings.device = str(device)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -28,7 +28,7 @@ from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
 from vlagents_ray_models.lerobot import checkpoint, samplers
 from vlagents_ray_models.lerobot.config import LeRobotConfig
-from vlagents_ray_models.lerobot.processors import Processors, adapter_processors
+from vlagents_ray_models.lerobot.processors import Processors, load_processors
 from vlagents_ray_models.lerobot.samplers import ACTION, STATE
 from vlagents_ray_models.model_code import remote_code
 from vlagents_ray_models.pi0_passes import Pi0Passes
@@ -57,10 +57,6 @@ class LoadedLeRobot:
     environment: list[str]  # parts of the environment's state; empty if the policy has none
     contract: Contract
     trained: DatasetContract  # contract of the training dataset; empty if the dataset has none
-    renames: dict[str, str]  # the dataset's camera -> the policy's observation key
-    # Fingerprint of an adapter -> the adapter's processors, if it was trained with other
-    # statistics.
-    adapter_processors: dict[str, Processors] = field(default_factory=dict)
 
 
 class LeRobot(ModelPolicy):
@@ -68,7 +64,6 @@ class LeRobot(ModelPolicy):
 
     Config: ClassVar[type] = LeRobotConfig
     trainable = network = "model.sampler.policy"
-    adaptable = True
     config: LeRobotConfig
 
     @property
@@ -120,9 +115,9 @@ class LeRobot(ModelPolicy):
         self._configure(sampler)
         self.config = _with_defaults(self.config, sampler)
 
-        processors = Processors(folder, settings, self.config, sampler.staging)
-        trained = _training_dataset(settings, processors)
-        model = self._describe(sampler, processors, trained, processors.rename_map)
+        adapter = None if self.adapter is None else self.adapter.folder
+        processors = load_processors(folder, adapter, settings, self.config, sampler.staging)
+        model = self._describe(sampler, processors, _training_dataset(settings, processors))
         self.statistics = _ranges(model)
         return model
 
@@ -144,12 +139,6 @@ class LeRobot(ModelPolicy):
             )
         if isinstance(sampler, samplers.FlowSampler):
             sampler.noise_level = self.config.noise_level
-            sampler.passes.adapters = self.adapters
-        elif self.config.adapters:
-            raise ConfigError(
-                f"adapters: expected one of LeRobot's {_FLOWS} for them, got {policy_type!r}; "
-                "merge each into its base"
-            )
         elif self.config.noise_level:
             raise ConfigError(
                 f"noise_level: expected 0 for LeRobot's {policy_type!r}, whose actions are not "
@@ -167,7 +156,6 @@ class LeRobot(ModelPolicy):
         sampler: samplers.Sampler,
         processors: Processors,
         trained: DatasetContract,
-        renames: dict[str, str],
     ) -> LoadedLeRobot:
         """Return the loaded checkpoint with the contract that follows from its training.
 
@@ -175,14 +163,13 @@ class LeRobot(ModelPolicy):
             sampler: The sampler with the loaded policy.
             processors: The processors of the dataset that `trained` describes.
             trained: The contract of the training dataset.
-            renames: The mapping from the dataset's cameras to the policy's observation keys.
 
         Raises:
             ConfigError: The settings name cameras or parts that do not fit, or the processors lack
                 statistics.
         """
         settings = sampler.config
-        cameras = _cameras(settings, self.config, renames, trained.cameras)
+        cameras = _cameras(settings, self.config, processors.rename_map, trained.cameras)
         vectors = [key for key in (STATE, ENVIRONMENT) if key in settings.input_features]
         processors.require_statistics(settings, [*cameras, *vectors])
 
@@ -204,48 +191,7 @@ class LeRobot(ModelPolicy):
             history=sampler.steps,
             behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
-        return LoadedLeRobot(
-            sampler, processors, cameras, state, environment, contract, trained, renames
-        )
-
-    def adapt(self, adapter: str, folder: Path) -> None:
-        """Store the processors that were saved with an adapter, if any, for the state and the
-        actions of the adapter's rows.
-
-        If the base does not describe its dataset, such as a base for many robots, the contract of
-        the adapter's dataset is used.
-
-        Raises:
-            ConfigError: The adapter's processors do not fit the base, or its dataset has another
-                contract.
-        """
-        model: LoadedLeRobot = self.model
-        settings = model.sampler.config
-        processors = adapter_processors(folder, settings, self.config, model.processors)
-        if processors is None:
-            return
-
-        dataset = processors.dataset()
-        renames = model.renames or processors.rename_map
-        trained = model.trained if dataset is None else _training_dataset(settings, processors)
-
-        has_same_names = processors.rename_map in ({}, renames)
-        is_base_undescribed = model.trained.contract == Contract() and model.trained.state in (
-            (),
-            trained.state,
-        )
-        has_same_contract = dataset in (None, model.trained)
-        if not has_same_names or not (is_base_undescribed or has_same_contract):
-            raise ConfigError(
-                f"{folder}: expected the contract and the names of cameras of the base and of the "
-                "adapters before, got others; serve it in a deployment of its own"
-            )
-
-        if trained != model.trained:
-            described = self._describe(model.sampler, model.processors, trained, renames)
-            model = replace(described, adapter_processors=model.adapter_processors)
-            self.model = model
-        model.adapter_processors[adapter] = processors
+        return LoadedLeRobot(sampler, processors, cameras, state, environment, contract, trained)
 
     def perceive(self, obs: Obs) -> StagedRow:
         """Return the images, (H, W, 3) uint8, and the state vectors, (D,), of an observation under
@@ -286,28 +232,14 @@ class LeRobot(ModelPolicy):
         model: LoadedLeRobot = self.model
         sampler, settings = model.sampler, model.sampler.config
 
-        leftovers = []
-        for row in rows:
-            processors = model.adapter_processors.get(row.adapter, model.processors)
-            leftovers.append(processors.leftover(row))
+        leftovers = [model.processors.leftover(row) for row in rows]
 
         # LeRobot's own loop does the same.
         mixed_precision = settings.use_amp and torch.device(settings.device).type == "cuda"
         with torch.inference_mode(), torch.autocast("cuda", enabled=mixed_precision):
             observed = [rows[i] for i in sampler.observed_rows(rows)]
             inputs = model.processors.observe(observed, sampler.steps)
-            for adapter, processors in model.adapter_processors.items():
-                indices = _rows_of(adapter, observed)
-                if indices and STATE in inputs:
-                    states = processors.normalised_state([observed[i] for i in indices])
-                    inputs[STATE][indices] = states
-
-            drawn = sampler.draw(inputs, rows, leftovers)
-            chunks = np.array(model.processors.actions(drawn))
-            for adapter, processors in model.adapter_processors.items():
-                indices = _rows_of(adapter, rows)
-                if indices:
-                    chunks[indices] = processors.actions(drawn[indices])
+            chunks = model.processors.actions(sampler.draw(inputs, rows, leftovers))
 
             behaviours: dict[int, dict[str, Any]] = {}
             if sampler.random_steps is not None:
@@ -319,11 +251,6 @@ class LeRobot(ModelPolicy):
             info = {GIVEN: sampler.prefix_rows[i]} if i in sampler.prefix_rows else {}
             predictions.append(Prediction(chunk, behaviour=behaviours.get(i, {}), info=info))
         return predictions
-
-
-def _rows_of(adapter: str, rows: Sequence[Row]) -> list[int]:
-    """Return the indices of the rows that use the adapter with this fingerprint."""
-    return [i for i, row in enumerate(rows) if row.adapter == adapter]
 
 
 def _with_defaults(config: LeRobotConfig, sampler: samplers.Sampler) -> LeRobotConfig:

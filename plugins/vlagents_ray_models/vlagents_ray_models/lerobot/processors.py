@@ -59,6 +59,7 @@ _NETWORK = (
     "resize_imgs_with_padding",
     "adapt_to_pi_aloha",
     "use_delta_joint_actions_aloha",
+    "use_relative_actions",
     "add_image_special_tokens",
     "attention_mode",
     "prefix_length",
@@ -100,10 +101,6 @@ class Processors:
                 f"processors: expected only the checkpoint's {[sorted(before), sorted(after)]}, "
                 f"got {unknown}; correct the names"
             )
-
-        self.steps = [list(before), list(after)]  # registered names of both pipelines
-        self.step_settings = _comparable_settings(before, config)
-        self.step_settings.update(_comparable_settings(after, config))
 
         saved_rename_map = before.get(_RENAME, {}).get("rename_map") or {}
         self.rename_map: dict[str, str] = dict(
@@ -163,14 +160,6 @@ class Processors:
                 }
         return {}
 
-    def normalises(self, feature: Any) -> bool:
-        """Return whether the pre-processor normalises a feature with its statistics."""
-        for step in _normalisers(self._before):
-            mode = step.norm_map.get(feature.type)
-            if getattr(mode, "name", "IDENTITY") != "IDENTITY":
-                return True
-        return False
-
     def dataset(self) -> DatasetContract | None:
         """Return the contract of the training dataset; None if the dataset has none."""
         contract_bytes = self.statistics(STATISTICS).get(BYTES)
@@ -218,12 +207,6 @@ class Processors:
                 batch[key] = values.permute(0, 3, 1, 2).float() / 255
         batch["task"] = instructions
         return {key: value for key, value in self._before(batch).items() if value is not None}
-
-    def normalised_state(self, rows: Sequence[Row]) -> Any:
-        """Return the last states of rows, (B, D) on the policy's device, in the policy's units."""
-        states = self.staging.upload(np.stack([row.frames[-1][STATE] for row in rows]))
-        [step] = _normalisers(self._before)
-        return step._normalize_observation({STATE: states}, inverse=False)[STATE]
 
     def actions(self, chunks: Any) -> np.ndarray:
         """Convert the policy's actions (B, T, D) to (B, T, D') float32, in the robot's units."""
@@ -303,24 +286,6 @@ def _of_steps(overrides: Mapping[str, Any], steps: Mapping[str, Any]) -> dict[st
     return {name: settings for name, settings in overrides.items() if name in steps}
 
 
-def _comparable_settings(
-    steps: Mapping[str, Mapping[str, Any]], config: LeRobotConfig
-) -> dict[str, dict[str, Any]]:
-    """Return the settings of the steps, without settings that depend on the dataset or on the
-    machine.
-
-    Settings that the deployment overrides are omitted, and so are the settings of steps that move,
-    rename or normalise values.
-    """
-    comparable: dict[str, dict[str, Any]] = {}
-    for name, settings in steps.items():
-        if name in (_DEVICE, _RENAME, *_NORMALIZERS):
-            continue
-        ignored = {_NAME, *config.processors.get(name, ())}
-        comparable[name] = {key: value for key, value in settings.items() if key not in ignored}
-    return comparable
-
-
 def _normalisers(pipeline: Any) -> list[Any]:
     """Return the steps of a pipeline that normalise or unnormalise."""
     return [step for step in pipeline.steps if hasattr(step, "norm_map")]
@@ -356,94 +321,51 @@ def _require_feature_statistics(pipeline: Any, key: str, settings: Any, file: st
         )
 
 
-def adapter_processors(
-    folder: Path, settings: Any, config: LeRobotConfig, base: Processors
-) -> Processors | None:
-    """Return the processors that were saved with an adapter.
+def load_processors(
+    folder: Path, adapter: Path | None, settings: Any, config: LeRobotConfig, staging: Staging
+) -> Processors:
+    """Load the processors of a checkpoint, or those that were saved with its adapter.
 
-    The adapter's dataset may have other statistics than the dataset of the base.
+    The adapter's dataset may have other statistics than the dataset of the checkpoint.
 
     Args:
-        folder: The adapter's folder.
+        folder: The folder of the checkpoint.
+        adapter: The folder of the adapter; None if there is none.
         settings: LeRobot's config object of the policy.
         config: The settings of the deployment.
-        base: The processors of the base.
-
-    Returns:
-        The processors; None if the adapter has none, in which case the processors of the base are
-        used.
+        staging: Copies inputs to the policy's device.
 
     Raises:
-        ConfigError: The processors differ from the base's processors in more than the statistics of
-            state and actions, or the policy's config in the same folder describes another network.
+        ConfigError: The processors do not load, the adapter's folder contains only one of both
+            pipelines, its processors are for states or actions of other lengths, or its config of
+            the policy describes another network.
     """
-    _require_same_network(folder / _CONFIG, settings, config)
-    missing = [name for name in PIPELINES if not (folder / name).is_file()]
+    if adapter is None:
+        return Processors(folder, settings, config, staging)
+
+    _require_same_network(adapter / _CONFIG, settings, config)
+    missing = [name for name in PIPELINES if not (adapter / name).is_file()]
     if len(missing) == len(PIPELINES):
-        return None
+        return Processors(folder, settings, config, staging)
     if missing:
         raise ConfigError(
-            f"{folder}: expected both pipelines as LeRobot saves them, or none of the two, got no "
+            f"{adapter}: expected both pipelines as LeRobot saves them, or none of the two, got no "
             f"{missing}; copy it there"
         )
 
     if not config.trust_remote_code:
         for name in PIPELINES:
-            require_known_steps(folder / name)
-    processors = Processors(folder, settings, config, base.staging)
-    features = {**settings.input_features, **settings.output_features}
-    processors.require_statistics(settings, [key for key in features if key != ACTION])
-
-    allowed = {ACTION} if settings.type in _STATE_IN_PROMPT else {STATE, ACTION}
-    differences = _differences(processors, base, settings, allowed)
-    if differences:
-        raise ConfigError(
-            f"{folder}: expected the base's processors, but for the statistics of "
-            f"{sorted(allowed)}, got other {', '.join(differences)}; merge the adapter into its "
-            "base, and serve that as a checkpoint of its own"
-        )
+            require_known_steps(adapter / name)
+    processors = Processors(adapter, settings, config, staging)
+    for key, feature in ((STATE, settings.robot_state_feature), (ACTION, settings.action_feature)):
+        length = len(processors.statistics(key).get("mean", ()))
+        if length and feature is not None and length != feature.shape[0]:
+            raise ConfigError(
+                f"{adapter}: {key}: expected statistics of {feature.shape[0]} numbers, as the base "
+                f"has, got {length}; merge the adapter into its base, and serve that as a "
+                "checkpoint of its own"
+            )
     return processors
-
-
-def _differences(
-    processors: Processors, base: Processors, settings: Any, allowed: set[str]
-) -> list[str]:
-    """Return the differences between an adapter's processors and the base's processors, for an
-    error message.
-
-    Statistics of the features in `allowed` may differ.
-    """
-    differences = []
-    if processors.steps != base.steps:
-        differences.append("steps")
-
-    changed_settings = [
-        name
-        for name, step in processors.step_settings.items()
-        if base.step_settings.get(name, step) != step
-    ]
-    if changed_settings:
-        differences.append(f"settings of {changed_settings}")
-
-    if processors.whole:
-        differences.append("actions relative to the state")
-
-    sizes, base_sizes = _sizes(processors), _sizes(base)
-    if sizes != base_sizes:
-        differences.append(f"numbers {sizes} of state and actions, not {base_sizes}")
-
-    changed_features = set()
-    for key, feature in {**settings.input_features, **settings.output_features}.items():
-        if processors.normalises(feature) and processors.statistics(key) != base.statistics(key):
-            changed_features.add(key)
-    if changed_features - allowed:
-        differences.append(f"statistics of {sorted(changed_features - allowed)}")
-    return differences
-
-
-def _sizes(processors: Processors) -> list[int]:
-    """Return the numbers of values in a state and in an action, according to the statistics."""
-    return [len(processors.statistics(key).get("mean", ())) for key in (STATE, ACTION)]
 
 
 def _require_same_network(file: Path, settings: Any, config: LeRobotConfig) -> None:

@@ -307,7 +307,6 @@ class FlowSampler(Sampler):
             batch,
             noise=noise,
             owners=self._shared(rows)[1],
-            fingerprints=[row.adapter for row in rows],
             steps=self.flow_steps,
             changes=changes,
             frozen=frozen,
@@ -466,7 +465,7 @@ class SmolVLAPasses(FlowPasses):
             hook = vision.embeddings.position_embedding.register_forward_pre_hook(
                 lambda _, inputs: captured.extend(inputs)
             )
-            with hook, self.adapters.rows(()):  # no adapter, since the image belongs to no row
+            with hook:
                 patches = [length // vision.patch_size for length in size]
                 mask = torch.ones(1, *patches, dtype=torch.bool, device=image.device)
                 vision.embeddings(image[:1].to(vision.dtype), mask)

@@ -9,7 +9,7 @@ masked entry for each future token.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,6 @@ from pydantic import Field
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.adapters import LoraAdapters
 from vlagents_ray.policies.base import Prediction, Row
 from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras
 from vlagents_ray.policies.base.staging import StagedRow
@@ -50,7 +49,6 @@ class OpenVLA(prismatic.PrismaticPolicy):
     config: OpenVLAConfig
     model: TokenDecoder
     trainable = "model.base.network"
-    adaptable = True
 
     def __init__(self, config: OpenVLAConfig) -> None:
         super().__init__(config)
@@ -71,13 +69,13 @@ class OpenVLA(prismatic.PrismaticPolicy):
         Raises:
             ConfigError: The checkpoint is incomplete, or the settings do not fit it.
         """
-        base = prismatic.load_prismatic(self.config)
+        base = prismatic.load_prismatic(self.config, adapter=self.adapter)
         if self.config.attention != "flash_attention_2":  # this attention uses the mask unchanged
             model = base.network.language_model.model
             model._update_causal_mask = partial(_causal_mask, model._update_causal_mask)
 
         longest = max(base.statistics.action_dims(self.config.unnorm_key))
-        decoder = TokenDecoder(base, longest, self.adapters)
+        decoder = TokenDecoder(base, longest)
         decoder.compile_with(self.compilation)
         return decoder
 
@@ -103,12 +101,8 @@ class OpenVLA(prismatic.PrismaticPolicy):
                 row_draws[: entry.scale.dim] = entry.row.rng.random(entry.scale.dim)
 
         firsts, owners = self.observations_of([entry.row for entry in prepared])
-        tokens, bin_logits = self.model.decode(
-            [prepared[i].model_input for i in firsts],
-            owners,
-            draws,
-            [prepared[i].row.adapter for i in firsts],
-        )
+        prompts = [prepared[i].model_input for i in firsts]
+        tokens, bin_logits = self.model.decode(prompts, owners, draws)
         return self._decoded(self.model.base.bins, prepared, tokens[:, None], bin_logits[:, None])
 
 
@@ -121,7 +115,6 @@ class TokenDecoder:
 
     base: prismatic.Prismatic
     longest: int  # largest number of tokens in an answer
-    adapters: LoraAdapters = field(default_factory=LoraAdapters)  # the adapters of the policy
 
     def compile_with(self, compilation: Compilation) -> None:
         """Replace the passes with their compiled forms, if they are compiled."""
@@ -134,7 +127,6 @@ class TokenDecoder:
         prompts: Sequence[tuple[StagedRow, list[int]]],
         owners: Sequence[int],
         draws: np.ndarray,
-        fingerprints: Sequence[str] = (),
     ) -> tuple[Any, Any]:
         """Decode R answers to P prompts.
 
@@ -143,21 +135,17 @@ class TokenDecoder:
             owners: The index of the prompt of each answer, (R,). A prompt with several answers is
                 processed once.
             draws: The draws for `ActionBins.choose`, (R, S), with a column for each token.
-            fingerprints: The adapter of each prompt, (P,), see `Row.adapter`; empty if no prompt
-                has an adapter.
 
         Returns:
             The tokens, (R, S), and the logits of the bins from which they were chosen, (R, S,
             bins).
         """
         torch, base, steps = require("torch"), self.base, draws.shape[1]
-        with torch.inference_mode(), self.adapters.rows(fingerprints):
+        with torch.inference_mode():
             quantiles = base.upload(draws)
             embeddings, mask = self._left_padded(prompts)
             hidden, cache = self.prefill(embeddings, mask)
 
-        answer_fingerprints = [fingerprints[i] for i in owners] if fingerprints else ()
-        with torch.inference_mode(), self.adapters.rows(answer_fingerprints):
             if list(owners) != list(range(len(prompts))):
                 index = base.upload(owners)
                 hidden, mask, cache = hidden[index], mask[index], cache[index]

@@ -15,7 +15,7 @@ import os
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -35,6 +35,7 @@ from vlagents_ray.policies.base.accelerator import (
     torch_device,
     torch_dtype,
 )
+from vlagents_ray.policies.base.adapter import LoraAdapter
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.policies.base.staging import StagedRow, Staging
@@ -219,8 +220,6 @@ class Prismatic:
     staging: Staging
     # The length to which shorter prompts are padded; 0 means the length of the longest prompt.
     padded_tokens: int
-    # Fingerprint of an adapter -> the adapter's statistics, if it was trained on other datasets.
-    adapter_statistics: dict[str, Statistics] = field(default_factory=dict)
 
     def stage(self, images: Sequence[np.ndarray]) -> StagedRow:
         """Convert V images, (H, W, 3) uint8, to the format of the checkpoint's backbones, and begin
@@ -310,12 +309,15 @@ class Prismatic:
         return require("torch").cat([zeros, *segments], 1).take_along_dim(indices[..., None], 1)
 
 
-def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic:
+def load_prismatic(
+    config: PrismaticConfig, bounds: Bounds = "q99", adapter: LoraAdapter | None = None
+) -> Prismatic:
     """Load a checkpoint of OpenVLA, or the base of an OpenVLA-OFT checkpoint.
 
     Args:
         config: The settings of the policy.
         bounds: The statistics with which values were normalised in training.
+        adapter: The adapter of the checkpoint, whose folder may contain other statistics.
 
     Returns:
         The checkpoint, on its device and in evaluation mode.
@@ -324,7 +326,10 @@ def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic
         ConfigError: The checkpoint is incomplete, or the settings do not fit it.
     """
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, _NEEDS)
-    statistics = Statistics.from_folder(path, bounds)
+    statistics_folder = path
+    if adapter is not None and (adapter.folder / STATISTICS_FILE).is_file():
+        statistics_folder = adapter.folder
+    statistics = Statistics.from_folder(statistics_folder, bounds)
     statistics.require(config.unnorm_key)
 
     device = torch_device(config.device)
@@ -623,8 +628,7 @@ class PrismaticPolicy(ModelPolicy):
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode; `kwargs` may contain `unnorm_key`, the dataset of its actions."""
         info = super().reset(obs, instruction, **kwargs)
-        episode = self._current_episode()
-        episode.memory[UNNORM_KEY] = self._requested_dataset(kwargs, episode.adapter)
+        self._current_episode().memory[UNNORM_KEY] = self._requested_dataset(kwargs)
         return info
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
@@ -632,7 +636,7 @@ class PrismaticPolicy(ModelPolicy):
 
         def prepare(row: Row) -> PreparedRow:
             key = self._dataset(row)
-            scale = self._statistics(row.adapter).scale(key)
+            scale = self._statistics.scale(key)
             return PreparedRow(row, scale, self._model_input(row, key))
 
         return compute_valid([attempt(prepare, row) for row in rows], self._compute)
@@ -640,30 +644,8 @@ class PrismaticPolicy(ModelPolicy):
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row of any dataset, since sessions may select their datasets later."""
         row = super()._example(seed, instruction)
-        datasets = self._statistics(row.adapter)
-        key = self._default_dataset(row.adapter) or datasets.names[0]
+        key = self.config.unnorm_key or self._statistics.names[0]
         return replace(row, memory={UNNORM_KEY: key})
-
-    def adapt(self, adapter: str, folder: Path) -> None:
-        """Store the statistics of the adapter's datasets, if the adapter's folder contains them.
-
-        Raises:
-            ConfigError: The lengths of the adapter's actions differ from the base's.
-        """
-        if not (folder / STATISTICS_FILE).is_file():
-            return
-
-        base_statistics = self._statistics()
-        statistics = Statistics.from_folder(folder, base_statistics.bounds)
-        dims = statistics.action_dims()
-        base_dims = base_statistics.action_dims(self.config.unnorm_key)
-        if not dims <= base_dims:
-            raise ConfigError(
-                f"{folder / STATISTICS_FILE}: expected actions of {sorted(base_dims)} numbers, as "
-                f"the base's, got {sorted(dims)}; merge the adapter into its base, and serve that "
-                "as a checkpoint of its own"
-            )
-        self.model.base.adapter_statistics[adapter] = statistics
 
     def _decoded(
         self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, bin_logits: Any
@@ -696,23 +678,13 @@ class PrismaticPolicy(ModelPolicy):
             predictions.append(prediction)
         return predictions
 
-    def _statistics(self, adapter: str = "") -> Statistics:
-        """Return the statistics of an adapter's datasets, or of the base's datasets if the
-        adapter has none.
-        """
+    @property
+    def _statistics(self) -> Statistics:
+        """The statistics of the datasets on which the loaded checkpoint was trained."""
         base: Prismatic = self.loaded().base
-        return base.adapter_statistics.get(adapter, base.statistics)
+        return base.statistics
 
-    def _default_dataset(self, adapter: str) -> str | None:
-        """Return the dataset that the settings select; None for an adapter with its own
-        datasets.
-        """
-        if self._statistics(adapter) is not self._statistics():
-            return None
-        name: str | None = self.config.unnorm_key
-        return name
-
-    def _requested_dataset(self, options: Mapping[str, Any], adapter: str) -> str | None:
+    def _requested_dataset(self, options: Mapping[str, Any]) -> str | None:
         """Return the key of the dataset that a client names in a reset or an observation; None if
         the client names no dataset.
         """
@@ -723,7 +695,7 @@ class PrismaticPolicy(ModelPolicy):
             raise InvalidObservation(
                 f"unnorm_key: expected a dataset's name, got {type(name).__name__}"
             )
-        return self._statistics(adapter).key(name)
+        return self._statistics.key(name)
 
     def _dataset(self, row: Row) -> str:
         """Return the key of a row's dataset.
@@ -732,11 +704,11 @@ class PrismaticPolicy(ModelPolicy):
         order of priority. Otherwise, it is the only dataset.
         """
         name = (
-            self._requested_dataset(row.info, row.adapter)
+            self._requested_dataset(row.info)
             or row.memory.get(UNNORM_KEY)
-            or self._default_dataset(row.adapter)
+            or self.config.unnorm_key
         )
-        return self._statistics(row.adapter).key(name)
+        return self._statistics.key(name)
 
     def _action(self) -> ActionSpec:
         """Describe an action.
@@ -745,7 +717,7 @@ class PrismaticPolicy(ModelPolicy):
         """
         dims: set[int] = set()
         if self.model is not None:
-            dims = self._statistics().action_dims(self.config.unnorm_key)
+            dims = self._statistics.action_dims(self.config.unnorm_key)
         dim = dims.pop() if len(dims) == 1 else None
         if dim == _SINGLE_ARM:
             return ActionSpec(dim=dim, gripper_open=1.0, gripper_closed=0.0)
