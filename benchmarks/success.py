@@ -141,7 +141,7 @@ def ways() -> list[Way]:
             for name, settings in LATE.items()
             for s in DELAYS
         ),
-        Way("LoRA adapter", adapter=True),
+        Way("LoRA merged", adapter=True),
     ]
 
 

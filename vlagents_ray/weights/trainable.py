@@ -559,7 +559,7 @@ def accepted(
     Args:
         current: The current values of the policy, by name.
         pushed: The new values, by name: numpy or JAX arrays or torch tensors, on any device.
-        partial: Whether names may be missing, as in a push of adapters only.
+        partial: Whether names may be missing, as in a push of some layers.
 
     Returns:
         The converted values by name, including names that are tied to a pushed name.

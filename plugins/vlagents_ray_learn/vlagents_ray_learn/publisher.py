@@ -116,8 +116,8 @@ class Publisher(AbstractContextManager["Publisher"]):
             mode: When sessions that follow the newest version change to it: at their next reset
                 ("next_episode"), or between two calls of the policy ("keep"). Robots follow only if
                 they reset with `weights="follow"`.
-            partial: Whether names may be missing, as when only adapters are trained. Their values
-                do not change.
+            partial: Whether names may be missing, as when only some layers are trained. The missing
+                values do not change.
             allow_same: Whether all values may be equal to the values of the policy.
             pin: Whether robots, and other sessions that do not follow the newest version, also use
                 this version after their next reset.
