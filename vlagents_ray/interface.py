@@ -62,14 +62,6 @@ LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan, from this ob
 # int: the expected number of ticks until the answer arrives, at most the number of rows of
 # LEFTOVER; 0 if unknown.
 DELAY = "delay_ticks"
-# The next three keys are in the observations of a robot with a planner
-# (`vlagents_ray.robot.planner`).
-GOAL = "goal"  # (D,) float32: the action of the planner's newest answer, such as a pose to reach
-# str: the task of the robot until the planner's next answer; this key is also in the Act of a
-# planner.
-SUBTASK = "subtask"
-# float: the time since the observation from which the planner computed its newest answer, ms.
-SUBTASK_AGE = "subtask_age_ms"
 # In an observation, float: the time that the server may take to answer, from the arrival of the
 # request, ms. It is 0 if the robot has no rows left.
 SLACK = "slack_ms"
@@ -79,9 +71,6 @@ TICKS = "ticks"
 # In an observation, float: the age of the last executed action of the policy, ms; absent if none
 # was executed since the last request.
 EXECUTED_AGE = "executed_age_ms"
-# In an observation, bool: whether the same robot also has a session with another model, and is
-# counted there.
-FURTHER_MODEL = "further_model"
 # In the Act of a server under load, float: how long the robot should wait after this answer before
 # its next request, ms.
 REPLAN = "replan_ms"

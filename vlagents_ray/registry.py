@@ -127,7 +127,6 @@ ENVS: dict[str, RegistryEntry] = {
 
 WRAPPERS: dict[str, RegistryEntry] = {
     "absolute_actions": RegistryEntry("vlagents_ray.policies.absolute_actions:AbsoluteActions"),
-    "subtasks": RegistryEntry("vlagents_ray.policies.subtasks:Subtasks"),
 }
 
 # Formats of `vlagents-ray export`. Each target is a function (results, path, **settings) that

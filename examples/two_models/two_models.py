@@ -7,11 +7,14 @@ real models. In the folder of this file, in two terminals:
     vlagents-ray serve two_models.yaml
     python two_models.py http://localhost:8000
 
-docs/fleet.md explains what happens if a model is late or not available.
+The planner is part of the robot, like a slow sensor: each observation contains its newest answer.
+So only the policy moves the robot.
 """
 
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,8 +28,8 @@ from vlagents_ray import (
     RemoteAgent,
     StateSpec,
 )
-from vlagents_ray.errors import InvalidObservation
-from vlagents_ray.robot import RobotWithPlanner, run_loop
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.robot import run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 
 TASK = "put the cup away"
@@ -78,37 +81,68 @@ class Reach(Agent):
         self.thinks_s = thinks_s
 
     def act(self, obs):
-        if "goal" not in obs.info:
-            raise InvalidObservation(
-                "info['goal']: expected the pose of a planner, got none; drive a RobotWithPlanner"
-            )
         time.sleep(self.thinks_s)
         joints, goal = obs.state["joints"], obs.info["goal"]
         reach = STEP * np.arange(1, ROWS + 1)[:, np.newaxis]  # (ROWS, 1), rad
         return Act((joints + np.clip(goal - joints, -reach, reach)).astype(np.float32))
 
 
+class GuidedArm(SimulatedRobot):  # replace SimulatedRobot with your arm
+    """An arm whose observations contain the planner's newest answer.
+
+    No tick waits for the planner. While the planner is late or down, its last answer remains in
+    use. The arm holds when that answer is older than `max_age_s`.
+    """
+
+    def __init__(self, planner, period_s=1.0, max_age_s=3.0):
+        super().__init__(CONTRACT)
+        self.planner, self.period_s, self.max_age_s = planner, period_s, max_age_s
+        self.thread = ThreadPoolExecutor(1)
+        self.call, self.called_s = None, 0.0  # the planner's last call, and the time of its start
+        self.problem = "it has not answered yet"
+
+    def __enter__(self):
+        obs, self.called_s = super().observe(), time.monotonic()
+        self.planner.initialize()
+        self.planner.reset(obs, TASK)
+        # The newest answer, and the time of its observation. Without one, the robot does not begin.
+        self.answer, self.seen_s = self.planner.act(obs), self.called_s
+        return self
+
+    def __exit__(self, *exc):
+        self.thread.shutdown()
+        self.planner.close()
+
+    def observe(self):
+        obs, now = super().observe(), time.monotonic()
+        if self.call is not None and self.call.done():
+            try:
+                self.answer, self.seen_s = self.call.result(), self.called_s
+            except VLAgentsError as error:
+                self.problem = str(error)
+            self.call = None
+        if self.call is None and now - self.called_s >= self.period_s:
+            self.call, self.called_s = self.thread.submit(self.planner.act, obs), now
+        return replace(obs, info={**obs.info, "goal": self.answer.action})
+
+    @property
+    def holds(self):
+        """The reason why the control loop must hold the arm, or None."""
+        age_s = time.monotonic() - self.seen_s
+        if age_s <= self.max_age_s:
+            return None
+        return f"the planner's answer is {age_s:.1f} s old: {self.problem}"
+
+
 def main(url):
-    """Perform the task, and print how many ticks of both models were in time."""
-    # Replace it with your arm: observe() -> Obs, apply(action), stop().
-    arm = SimulatedRobot(CONTRACT)
+    """Perform the task, and print the result."""
     planner = RemoteAgent(f"{url}/planner", timeout_s=5)
     policy = RemoteAgent(f"{url}/policy", timeout_s=5)
-    with (
-        # Each observation contains the newest subtask. The robot holds still while the subtask is
-        # older than 3 s.
-        RobotWithPlanner(arm, planner, instruction=TASK, hz=1, max_age_s=3) as robot,
-        ChunkPlayer(policy, PlayerSettings(mode="async")) as player,
-    ):
-        report = run_loop(
-            robot, player, hz=10, seconds=40, until=lambda: robot.task_done, instruction=TASK
-        )
-
-    print(f"{TASK}: {'done' if robot.task_done else 'not done'}")
-    for model, timeliness in (("policy", report.timeliness), ("planner", robot.planner_timeliness)):
-        figures = timeliness.time_share
-        if figures.share is not None:
-            print(f"{model}: {figures.share:.1%} of {figures.ticks} ticks in time")
+    player = ChunkPlayer(policy, PlayerSettings(mode="async"))
+    with player, GuidedArm(planner) as arm:
+        report = run_loop(arm, player, hz=10, seconds=40, until=lambda: arm.answer.done)
+    print(f"{TASK}: {'done' if arm.answer.done else 'not done'}")
+    print(f"policy: {report.timeliness.time_share.share:.1%} of its ticks in time")
     print(f"held for: {report.reasons or 'nothing'}")
 
 

@@ -435,16 +435,6 @@ def test_a_policy_of_single_actions_drives_in_each_mode(
     assert status == (1 if safe else 0)
 
 
-@pytest.mark.usefixtures("served")
-def test_a_robot_with_a_planner_has_its_punctuality_in_the_report(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    planner = ["--planner", "http://nowhere/planner", "--planner-hz", "5"]
-    # A busy machine may miss ticks.
-    assert drive([*SHORT, "--hz", "20", *planner]) in (0, 1, 3)
-    assert re.search(r"planner: \d+\.\d\d% of \d+ answers in time", capsys.readouterr().out)
-
-
 def test_the_simulated_robot_takes_actions_of_which_nothing_is_stated(
     served: Callable[..., None],
 ) -> None:
@@ -534,11 +524,6 @@ def test_what_does_not_fit_ends_the_command_before_anything_is_timed(
         (["--max-age-s", "0"], "argument --max-age-s: expected a number above 0, got '0'"),
         (["--deadline-ms", "-1"], "argument --deadline-ms: expected a number from 0, got '-1'"),
         (["--silent-s", "soon"], "argument --silent-s: expected a number above 0, got 'soon'"),
-        (["--planner", "x", "--planner-hz", "0"], "--planner-hz: expected a number above 0"),
-        (
-            ["--planner-max-age-s", "3"],
-            "--planner-hz and --planner-max-age-s: expected --planner with them, got none",
-        ),
         (
             ["--mode", "open_loop", "--rtc"],
             "--merge and --rtc: expected --mode async with them, got --mode open_loop",

@@ -13,13 +13,12 @@ import pytest
 import vlagents_ray
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.evaluate.robot.trial import WatchedRobot
-from vlagents_ray.interface import Agent, Obs
-from vlagents_ray.robot.loop import Robot, robot_watchdog
-from vlagents_ray.robot.planner import RobotWithPlanner
+from vlagents_ray.interface import Obs
+from vlagents_ray.robot.loop import robot_watchdog
 from vlagents_ray.robot.wrapper import RobotWrapper
 
 ROOT = Path(vlagents_ray.__file__).parents[1]
-WRAPPERS: list[type[RobotWrapper]] = [RobotWrapper, WatchedRobot, RobotWithPlanner]
+WRAPPERS: list[type[RobotWrapper]] = [RobotWrapper, WatchedRobot]
 OPTIONAL = {  # attributes that the package reads, and one that it does not know
     "simulated": True,
     "holds": "the wrist camera hangs",
@@ -54,13 +53,6 @@ class Arm:
         self.calls.append("close")
 
 
-def wrapped_by(wrapper: type[RobotWrapper], robot: Robot) -> RobotWrapper:
-    """Return a robot in a wrapper that changes nothing yet."""
-    if wrapper is RobotWithPlanner:
-        return RobotWithPlanner(robot, Agent())
-    return wrapper(robot)
-
-
 @pytest.mark.parametrize("wrapper", WRAPPERS)
 @pytest.mark.parametrize("depth", [1, 2])
 @pytest.mark.parametrize("name", OPTIONAL)
@@ -68,9 +60,9 @@ def test_a_wrapper_has_each_attribute_of_its_robot_now(
     wrapper: type[RobotWrapper], depth: int, name: str
 ) -> None:
     arm = Arm()
-    wrapped = wrapped_by(wrapper, arm)
+    wrapped = wrapper(arm)
     for _ in range(depth - 1):
-        wrapped = wrapped_by(wrapper, wrapped)
+        wrapped = wrapper(wrapped)
     assert not hasattr(wrapped, name), "an attribute that the robot lacks is not invented"
     setattr(arm, name, OPTIONAL[name])
     assert getattr(wrapped, name) is OPTIONAL[name]
@@ -83,7 +75,7 @@ def test_a_wrapper_has_each_attribute_of_its_robot_now(
 @pytest.mark.parametrize("wrapper", WRAPPERS)
 def test_a_wrapper_calls_its_robot_and_can_be_copied(wrapper: type[RobotWrapper]) -> None:
     arm = Arm()
-    wrapped = wrapped_by(wrapper, arm)
+    wrapped = wrapper(arm)
     wrapped.observe()
     wrapped.apply(np.zeros(2, np.float32))
     wrapped.stop()
@@ -102,7 +94,7 @@ def test_the_watchdog_of_a_wrapped_robot_also_watches_the_robots_own_sources(
     arm.silent_s = {"/joint_states": 0.01}  # type: ignore[attr-defined]
     arm.watchdog = None  # type: ignore[attr-defined]
     reasons: list[str] = []
-    with robot_watchdog(wrapped_by(wrapper, arm), reasons.append, {"server": 60.0}) as watchdog:
+    with robot_watchdog(wrapper(arm), reasons.append, {"server": 60.0}) as watchdog:
         assert arm.watchdog is watchdog  # type: ignore[attr-defined]
         while not reasons:
             watchdog.heard("server")

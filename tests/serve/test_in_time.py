@@ -10,7 +10,7 @@ import pytest
 from in_flight import answered, submit
 
 from vlagents_ray.errors import InvalidInput
-from vlagents_ray.interface import EXECUTED_AGE, FURTHER_MODEL, TICKS, Obs
+from vlagents_ray.interface import EXECUTED_AGE, TICKS, Obs
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Priority, Request
 from vlagents_ray.serve.engine.engine import Engine
@@ -20,10 +20,9 @@ from vlagents_ray.serve.in_time import Goodput, RobotReport, RobotTimes, describ
 def test_a_report_is_optional_and_checked() -> None:
     assert RobotReport.of({}) is None
     assert RobotReport.of({"captured_at": 1.0}) is None
-    assert RobotReport.of({TICKS: [8, 1], EXECUTED_AGE: 120.5}) == (8, 1, 120.5, False)
-    assert RobotReport.of({TICKS: (8, 8)}) == (8, 8, None, False)
-    assert RobotReport.of({EXECUTED_AGE: 0}) == (0, 0, 0.0, False)
-    assert RobotReport.of({TICKS: [8, 1], FURTHER_MODEL: True}) == (8, 1, None, True)
+    assert RobotReport.of({TICKS: [8, 1], EXECUTED_AGE: 120.5}) == (8, 1, 120.5)
+    assert RobotReport.of({TICKS: (8, 8)}) == (8, 8, None)
+    assert RobotReport.of({EXECUTED_AGE: 0}) == (0, 0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +43,6 @@ def test_a_report_is_optional_and_checked() -> None:
         {EXECUTED_AGE: True},
         {EXECUTED_AGE: "1"},
         {EXECUTED_AGE: 2**40},
-        {TICKS: [8, 1], FURTHER_MODEL: 1},
     ],
 )
 def test_wrong_reports_are_refused(info: dict[str, Any]) -> None:

@@ -52,7 +52,6 @@ from vlagents_ray.robot.loop import (
     robot_watchdog,
     run_loop,
 )
-from vlagents_ray.robot.planner import RobotWithPlanner
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.terminal import typed_keys
@@ -67,7 +66,6 @@ MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0
 _HZ = 50.0  # default control rate of a robot
 _MOST_HZ = 10_000.0  # maximum control rate; no arm and no loop in Python is faster
-_PLANNER_HZ, _PLANNER_MAX_AGE_S = 1.0, 5.0
 _LABELS = {"y": "success", "n": "failure"}
 KEYS = (
     "keys: p pauses and continues; y (success), n (failure), x (discard) and q end the run and "
@@ -148,12 +146,6 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
             "NAME:ARGUMENT or MODULE:CLASS"
         )
 
-    if options.planner is None and (options.planner_hz or options.planner_max_age_s):
-        parser.error(
-            "--planner-hz and --planner-max-age-s: expected --planner with them, got none; give "
-            "the URL of the planner"
-        )
-
     if options.mode is None:
         options.mode = "open_loop" if in_env else "async"
     if options.mode != "async" and (options.merge != "newest" or options.rtc):
@@ -202,7 +194,8 @@ def _run(options: argparse.Namespace) -> LoopReport:
         player.initialize()  # raises for unsuitable settings before the robot moves
 
         make_robot = make_robot or partial(SimulatedRobot, contract)
-        robot = stack.enter_context(_opened_robot(options, make_robot))
+        robot = stack.enter_context(opened(make_robot))
+        _require_part(options.measure, robot)
         fit = _require_fit(options, agent, robot, guard.limits, say)
 
         recorder = None
@@ -220,7 +213,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
 
         def is_over() -> bool:
             keys.say_restart()
-            return keys.over or _is_task_done(robot)
+            return keys.over
 
         loop_options = LoopOptions(
             restart=options.restart,
@@ -247,8 +240,6 @@ def _run(options: argparse.Namespace) -> LoopReport:
             failure = error
 
         _say_report(report, f"{options.mode}, {agent.transport}", say, led=leader is not None)
-        if report.jitter:
-            _say_planner(robot, say)
 
     if recorder is not None:  # the recorder is closed, so that all frames are written
         say(
@@ -305,41 +296,6 @@ def _opened_leader(
         if help_text:
             say(help_text)
         yield leader
-
-
-@contextlib.contextmanager
-def _opened_robot(options: argparse.Namespace, make_robot: Callable[[], Robot]) -> Iterator[Robot]:
-    """Open the robot within the context, with the planner of the options, if there is one."""
-    with opened(make_robot) as robot:
-        _require_part(options.measure, robot)
-        if options.planner is None:
-            yield robot
-            return
-
-        planner = RemoteAgent(
-            options.planner, transport=options.transport, timeout_s=options.timeout_s
-        )
-        with RobotWithPlanner(
-            robot,
-            planner,
-            instruction=options.instruction,
-            hz=options.planner_hz or _PLANNER_HZ,
-            max_age_s=options.planner_max_age_s or _PLANNER_MAX_AGE_S,
-        ) as planned_robot:
-            yield planned_robot
-
-
-def _is_task_done(robot: Robot) -> bool:
-    """Return whether the planner of a robot, if it has one, considers the task finished."""
-    return isinstance(robot, RobotWithPlanner) and robot.task_done
-
-
-def _say_planner(robot: Robot, say: Callable[[str], None]) -> None:
-    """Print the share of the planner's answers that arrived in time, if the robot has a planner."""
-    if isinstance(robot, RobotWithPlanner):
-        figures = robot.planner_timeliness.time_share
-        if figures.share is not None:
-            say(f"planner: {figures.share:.2%} of {figures.ticks} answers in time")
 
 
 def _guard(options: argparse.Namespace, contract: Contract | None, hz: float) -> Guard:
@@ -900,7 +856,7 @@ def _add_safety_options(options: _Options) -> None:
 
 
 def _add_server_options(options: _Options) -> None:
-    """Add the options of the server and of the planner."""
+    """Add the options of the server."""
     seconds = number(above=True)
 
     options.begin("Server (not with --env)")
@@ -930,24 +886,4 @@ def _add_server_options(options: _Options) -> None:
         default=SHARE,
         metavar="SHARE",
         help="Share of the ticks that need an action within --slo-age-ms.",
-    )
-
-    options.begin("Planner (not with --env)")
-    options.robot(
-        "--planner",
-        metavar="URL",
-        help="URL of a planner, a second and slower model. Each observation of the policy contains "
-        "its newest subtask, and the robot holds while that is too old.",
-    )
-    options.robot(
-        "--planner-hz",
-        type=number(above=True, maximum=_MOST_HZ),
-        metavar="HZ",
-        help=f"Rate at which the planner is called; default: {_PLANNER_HZ:g}.",
-    )
-    options.robot(
-        "--planner-max-age-s",
-        type=seconds,
-        metavar="S",
-        help=f"Age, in seconds, above which a subtask is too old; default: {_PLANNER_MAX_AGE_S:g}.",
     )

@@ -7,7 +7,6 @@ from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.robot.guard import Guard
 from vlagents_ray.robot.limits import MotionLimits
 from vlagents_ray.robot.loop import LoopOptions, LoopReport, Robot, run_loop
-from vlagents_ray.robot.planner import RobotWithPlanner
 from vlagents_ray.robot.watchdog import Watchdog
 
 __all__ = [
@@ -18,7 +17,6 @@ __all__ = [
     "MotionLimits",
     "Robot",
     "RobotControl",
-    "RobotWithPlanner",
     "Watchdog",
     "run_loop",
 ]

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.errors import InvalidInput
-from vlagents_ray.interface import EXECUTED_AGE, FURTHER_MODEL, TICKS
+from vlagents_ray.interface import EXECUTED_AGE, TICKS
 from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.slo import SHARE
 
@@ -36,7 +36,6 @@ class RobotReport(NamedTuple):
     ticks: int  # ticks since the last request at which the policy had to act
     starved: int  # number of these ticks without a row of an answer
     age_ms: float | None  # age of the last executed action, ms; None if there was none
-    is_of_further_model: bool = False  # whether the session of another model counts the robot
 
     @classmethod
     def of(cls, info: Mapping[str, Any]) -> RobotReport | None:
@@ -59,23 +58,16 @@ class RobotReport(NamedTuple):
                 f"{reprlib.repr(ticks)}"
             )
 
-        is_of_further_model = info.get(FURTHER_MODEL, False)
-        if type(is_of_further_model) is not bool:
-            raise InvalidInput(
-                f"info[{FURTHER_MODEL!r}]: expected true or false, got "
-                f"{reprlib.repr(is_of_further_model)}"
-            )
-
         age_ms = info.get(EXECUTED_AGE)
         if age_ms is None:
-            return cls(all_ticks, starved, None, is_of_further_model)
+            return cls(all_ticks, starved, None)
         # A NaN fails the comparison.
         if type(age_ms) not in (int, float) or not 0 <= age_ms <= _MOST_AGE_MS:
             raise InvalidInput(
                 f"info[{EXECUTED_AGE!r}]: expected a number in [0, {_MOST_AGE_MS:g}], got "
                 f"{reprlib.repr(age_ms)}"
             )
-        return cls(all_ticks, starved, float(age_ms), is_of_further_model)
+        return cls(all_ticks, starved, float(age_ms))
 
 
 class RobotTimes:
@@ -85,7 +77,6 @@ class RobotTimes:
         """Create the record of a session, without reports."""
         self.priority = priority
         self.target_share = SHARE  # required share of ticks that have an action in time
-        self.is_of_further_model = False  # whether the session of another model counts the robot
         self.ticks = 0  # total number of ticks
         self.starved = 0  # total number of starved ticks
         self._lock = threading.Lock()
@@ -97,7 +88,6 @@ class RobotTimes:
     def add(self, report: RobotReport, now: float) -> None:
         """Add a report that arrived at `now`, s."""
         second = math.floor(now)
-        self.is_of_further_model = report.is_of_further_model
         with self._lock:
             self.ticks += report.ticks
             self.starved += report.starved

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +16,7 @@ from vlagents_ray.serve.models.loaded_model import GpuWork
 from vlagents_ray.serve.replica import metrics
 from vlagents_ray.serve.replica.metrics import Exporter
 
-SERIES = 29  # number of metrics with values in a replica without a GPU, for any number of robots
+SERIES = 25  # number of metrics with values in a replica without a GPU, for any number of robots
 
 
 def test_the_series_of_a_gpu_have_values_only_with_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,35 +55,6 @@ def test_the_series_of_a_gpu_have_values_only_with_one(monkeypatch: pytest.Monke
     assert written["gpu_ms"][1:] == [(1.5,)]
     assert written["graph_replays"][1:] == [(4,)]
     assert written["out_of_memory"] == [(3,)]
-    engine.close()
-
-
-def test_a_robot_with_two_models_is_counted_once_as_the_first(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    written: dict[tuple[str, str], float] = {}
-
-    def series(_tags: object, _kind: object, name: str, *_: object, **__: object) -> Any:
-        def write(value: float = 1.0, tags: dict[str, str] | None = None) -> None:
-            if tags is not None and tags.get("priority") == "robot" and "model" in tags:
-                written[name, tags["model"]] = value
-
-        return SimpleNamespace(set=write, inc=write, observe=write)
-
-    monkeypatch.setattr(metrics, "series", series)
-    engine = Engine(Noop.from_config({}), EngineSettings(threaded=False))
-    engine.start()
-    policy, late_planner = RobotTimes(), RobotTimes()
-    policy.add(RobotReport(10, 0, 30.0), engine.clock())
-    late_planner.add(RobotReport(10, 5, 30.0, is_of_further_model=True), engine.clock())
-    monkeypatch.setattr(engine.sessions, "times", lambda: [policy, late_planner])
-    Exporter(engine, {}).export()
-    assert written == {
-        ("robots", "first"): 1,
-        ("robots", "further"): 1,
-        ("goodput", "first"): 1,
-        ("goodput", "further"): 0,
-    }
     engine.close()
 
 
@@ -157,16 +127,13 @@ def test_the_number_of_series_does_not_grow_with_the_robots(
         if name in in_time:
             labels[name].append(tags)
     robot = (("priority", "robot"),)
-    by_model = [
-        (("model", model), ("priority", priority))
-        for model, priority in itertools.product(("first", "further"), ("robot", "simulation"))
-    ]
+    by_priority = [(("priority", priority),) for priority in ("robot", "simulation")]
     assert labels == {
         "ticks": [robot],
         "starved_ticks": [robot],
         "executed_age_ms": [robot],
-        "robots": by_model,
-        "goodput": by_model,
+        "robots": by_priority,
+        "goodput": by_priority,
     }
     assert len(series_of_values) == SERIES
     engine.close()

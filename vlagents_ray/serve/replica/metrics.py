@@ -132,17 +132,14 @@ class Exporter:
             "priority",
             boundaries=MS_BOUNDARIES,
         )
-        # The values of the tag `model` are `first`, and `further` for each additional model of a
-        # robot.
         self._robots = make(
-            Gauge, "robots", "Robots that reported ticks in the last 10 s.", "priority", "model"
+            Gauge, "robots", "Robots that reported ticks in the last 10 s.", "priority"
         )
         self._goodput = make(
             Gauge,
             "goodput",
             "Robots whose share of ticks in time reached its target.",
             "priority",
-            "model",
         )
         self._slo_load = make(
             Gauge,
@@ -193,15 +190,10 @@ class Exporter:
     def _export_robots(self) -> None:
         """Export the number of robots, and the number of robots in time."""
         now, times = self._engine.clock(), self._engine.sessions.times()
-        by_model = {
-            "first": [robot for robot in times if not robot.is_of_further_model],
-            "further": [robot for robot in times if robot.is_of_further_model],
-        }
-        for model, robots in by_model.items():
-            for priority, count in goodput(robots, now).items():
-                tags = {"priority": priority.name.lower(), "model": model}
-                self._robots.set(count.robots, tags)
-                self._goodput.set(count.in_time, tags)
+        for priority, count in goodput(times, now).items():
+            tags = {"priority": priority.name.lower()}
+            self._robots.set(count.robots, tags)
+            self._goodput.set(count.in_time, tags)
 
     def _export_collected(self, collected: Collected) -> None:
         for (op, transport, priority, code), sample in collected.requests.items():
