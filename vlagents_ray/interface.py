@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 # The keys of `Obs.info` and `Act.info` that this package interprets. Other keys are also allowed,
 # with values of the types listed at `Obs.info`.
 GOAL_IMAGE = "goal_image"  # (H, W, 3) uint8 RGB, for goal-conditioned policies
-DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
 # In an observation: N, the number of samples from the policy's action distribution that the Act
 # returns.
 SAMPLES = "samples"
@@ -356,7 +355,7 @@ def copied(obs: Obs) -> Obs:
 
 
 def _copied(value: Any) -> Any:
-    """Copy arrays at any depth of dicts and lists, such as the array of each camera in `DEPTH`."""
+    """Copy arrays at any depth of dicts and lists."""
     if isinstance(value, np.ndarray):
         return np.array(value)
     if isinstance(value, dict):
