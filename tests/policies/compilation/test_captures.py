@@ -384,7 +384,7 @@ def test_a_flow_is_one_graph_and_one_of_each_step_if_steps_are_changed(
             ((), 2),
             ([lambda velocity, actions, time: velocity - time * actions], 1 + STEPS),
         ):
-            inputs = drawn(cuda, rows) | {"changes": changes, "fingerprints": [""] * rows}
+            inputs = drawn(cuda, rows) | {"changes": changes}
             wanted = plain.sample(**inputs)
             cuda.replays.clear()
             same(passes.sample(**inputs), wanted)

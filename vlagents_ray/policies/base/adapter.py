@@ -210,8 +210,11 @@ class LoraAdapter:
             )
 
         alpha = self.config.get("lora_alpha")
-        is_number = isinstance(alpha, int | float) and not isinstance(alpha, bool)
-        if not is_number or not math.isfinite(alpha):
+        if (
+            not isinstance(alpha, int | float)
+            or isinstance(alpha, bool)
+            or not math.isfinite(alpha)
+        ):
             raise ConfigError(
                 f"{self.folder / CONFIG}: lora_alpha: expected a number, got {alpha!r}"
             )

@@ -1,6 +1,4 @@
-"""LoRA adapters over transformers' π0, chosen by session in one batch, against each one merged
-into its base.
-"""
+"""A LoRA adapter over transformers' π0 that is merged when the policy loads."""
 
 from __future__ import annotations
 
@@ -26,15 +24,14 @@ ATOL = 1e-4  # of actions of size 1, which ten steps of a flow and the merged su
 TARGETS = (
     r".*\.(q_proj|v_proj|down_proj|fc1|fc2|patch_embedding|linear)|action_.*|embed_action_time\..*"
 )
-CHOSEN = ("first", None, "second", "first", "second")
+ROWS = 3
 
 
 @pytest.fixture(scope="module")
 def saved(
     folder: Path, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, tuple[Path, dict[str, np.ndarray]]]:
-    """Folders and values of adapters, by their names."""
-    root, adapters = tmp_path_factory.mktemp("adapters"), {}
+) -> tuple[Path, dict[str, np.ndarray]]:
+    """The folder and the values of an adapter."""
     network = made(folder).model.network
     adaptable = (torch.nn.Linear, torch.nn.Conv2d)
     layers = {}
@@ -43,81 +40,77 @@ def saved(
             layers[name] = module
     assert {type(module) for module in layers.values()} == set(adaptable)
 
-    for seed, (name, rank) in enumerate((("first", 2), ("second", 4))):
-        random_values = pairs(network, list(layers), rank, seed)
-        values = {key: 0.3 * value for key, value in random_values.items()}
-        adapters[name] = save(root / name, values), values
-    return adapters
+    values = {key: 0.3 * value for key, value in pairs(network, list(layers), 4).items()}
+    return save(tmp_path_factory.mktemp("adapters") / "own", values), values
 
 
-def begun(policy: Pi0, seed: int, **options: Any) -> Pi0:
+def begun(policy: Pi0, seed: int) -> Pi0:
     session = AgentCopies(policy).make()
-    session.reset(seen(seed), WORDS[seed % len(WORDS)], seed=seed, **options)
+    session.reset(seen(seed), WORDS[seed % len(WORDS)], seed=seed)
     assert isinstance(session, Pi0)
     return session
 
 
-def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
-    folder: Path, saved: dict[str, tuple[Path, dict[str, np.ndarray]]]
+def acts_of(policy: Pi0) -> list[Act]:
+    """Return the first answers of several sessions in one batch, one of them with samples."""
+    views = [seen(seed, **{SAMPLES: 3 * (seed % 2)}) for seed in range(ROWS)]
+    acts = []
+    for act in policy.act_batch(views, [begun(policy, seed) for seed in range(ROWS)]):
+        assert isinstance(act, Act)
+        acts.append(act)
+    return acts
+
+
+@pytest.mark.parametrize("config", [{}, {"compile": True, "batch_sizes": [1, 6]}])
+def test_the_policy_acts_as_its_base_with_merged_weights(
+    folder: Path, saved: tuple[Path, dict[str, np.ndarray]], config: dict[str, Any]
 ) -> None:
-    policy = made(folder, adapters={name: str(path) for name, (path, _) in saved.items()})
-    views = [seen(seed, **{SAMPLES: 3 * (seed % 2)}) for seed in range(len(CHOSEN))]
-    acts = policy.act_batch(
-        views, [begun(policy, seed, adapter=name) for seed, name in enumerate(CHOSEN)]
-    )
-    base = made(folder)
-    plain = [begun(base, seed).act(views[seed]).action for seed in range(len(CHOSEN))]
-    for chosen in (None, "first", "second"):
-        alone = made(folder)
-        if chosen is not None:
-            merge(alone.model.network, saved[chosen][1])
-        for seed, act in enumerate(acts):
-            if CHOSEN[seed] != chosen:
-                continue
-            expected = begun(alone, seed).act(views[seed])
-            assert isinstance(act, Act)
-            np.testing.assert_allclose(act.action, expected.action, atol=ATOL)
-            if DISTRIBUTION in expected.info:
-                np.testing.assert_allclose(
-                    act.info[DISTRIBUTION]["samples"],
-                    expected.info[DISTRIBUTION]["samples"],
-                    atol=ATOL,
-                )
-            assert chosen is None or np.abs(expected.action - plain[seed]).max() > 100 * ATOL
+    adapter, values = saved
+    base, merged = made(folder), made(folder)
+    merge(merged.model.network, values)
+    for act, expected, of_base in zip(
+        acts_of(made(folder, adapter=str(adapter), **config)),
+        acts_of(merged),
+        acts_of(base),
+        strict=True,
+    ):
+        np.testing.assert_allclose(act.action, expected.action, atol=ATOL)
+        if DISTRIBUTION in expected.info:
+            np.testing.assert_allclose(
+                act.info[DISTRIBUTION]["samples"], expected.info[DISTRIBUTION]["samples"], atol=ATOL
+            )
+        assert np.abs(expected.action - of_base.action).max() > 100 * ATOL
 
 
-def test_a_learner_pushes_one_of_several_adapters(
-    folder: Path, saved: dict[str, tuple[Path, dict[str, np.ndarray]]]
+def test_a_learner_pushes_whole_layers(
+    folder: Path, saved: tuple[Path, dict[str, np.ndarray]]
 ) -> None:
-    policy = made(folder, adapters={name: str(path) for name, (path, _) in saved.items()})
-    unchanged = (None, "second")
-    before = [begun(policy, 0, adapter=name).act(seen(0)).action for name in unchanged]
-    check_pushed_weights(
-        policy, lambda: begun(policy, 0, adapter="first").act(seen(0)).action, "first/"
-    )
-    for name, action in zip(unchanged, before, strict=True):
-        assert np.array_equal(begun(policy, 0, adapter=name).act(seen(0)).action, action)
+    policy = made(folder, adapter=str(saved[0]))
+    check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
 
 
-def test_an_adapter_with_other_statistics_is_refused(
-    folder: Path, saved: dict[str, tuple[Path, dict[str, np.ndarray]]], tmp_path: Path
+def test_statistics_of_the_adapter_replace_those_of_the_base(
+    folder: Path, saved: tuple[Path, dict[str, np.ndarray]], tmp_path: Path
 ) -> None:
-    adapter = shutil.copytree(saved["first"][0], tmp_path / "own")
-    adapters = {"own": str(adapter)}
-    file = Path(shutil.copy(folder / "processor_config.json", adapter))
-    made(folder, adapters=adapters)
+    adapter = shutil.copytree(saved[0], tmp_path / "own")
+    of_base = begun(made(folder, adapter=str(adapter)), 0).act(seen(0)).action
 
-    processor = json.loads(file.read_text())
-    file.write_text(json.dumps(processor | {"state_mean": None}))  # it has no statistics of states
-    made(folder, adapters=adapters)
+    processor = json.loads((folder / "processor_config.json").read_text())
+    mean = [value + 1 for value in processor["actions_mean"]]
+    file = adapter / "processor_config.json"
+    file.write_text(json.dumps({"actions_mean": mean, "state_mean": None}))
+    shifted = begun(made(folder, adapter=str(adapter)), 0).act(seen(0)).action
+    np.testing.assert_allclose(shifted, of_base + 1, atol=ATOL)
+
+    whole = shutil.copytree(folder, tmp_path / "whole")
+    processor["state_mean"][0] += 1
+    for path in (file, whole / "processor_config.json"):
+        path.write_text(json.dumps(processor))
+    got = begun(made(folder, adapter=str(adapter)), 0).act(seen(0)).action
+    merged = made(whole)
+    merge(merged.model.network, saved[1])
+    np.testing.assert_allclose(got, begun(merged, 0).act(seen(0)).action, atol=ATOL)
 
     file.write_text("[3]")
-    with pytest.raises(ConfigError, match=r"adapter 'own': .*is no processor's config"):
-        made(folder, adapters=adapters)
-
-    processor["state_mean"][0] += 1
-    file.write_text(json.dumps(processor))
-    with pytest.raises(
-        ConfigError, match=r"adapter 'own': .*expected \['state_mean'\] as the base has, got others"
-    ):
-        made(folder, adapters=adapters)
+    with pytest.raises(ConfigError, match="is no processor's config"):
+        made(folder, adapter=str(adapter))
