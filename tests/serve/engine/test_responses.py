@@ -100,13 +100,13 @@ def test_sessions_to_which_a_policy_gives_one_info_have_each_their_own() -> None
     """Data that the server adds to one answer, such as a command to that robot, is in no other
     answer.
     """
-    shared = {"upstream_ms": 1.0}
+    shared = {"batch_ms": 1.0}
     (one, _), (other, _) = (
         replied(Act(np.zeros(1), info=shared)),
         replied(Act(np.zeros(1), info=shared)),
     )
     one.act.info["command"] = "stop"
-    assert other.act.info == shared == {"upstream_ms": 1.0}
+    assert other.act.info == shared == {"batch_ms": 1.0}
 
 
 def test_nothing_of_what_is_too_large_is_copied_or_looked_at(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 import uuid
 import weakref
 from collections.abc import Mapping, Sequence
@@ -164,10 +163,6 @@ class UpstreamConfig(BaseModel, extra="forbid"):
         return read_mapping(self.mapping if self.mapping is not None else str(self.client.mapping))
 
 
-# The key in `Act.info` of the upstreams' time for the batch, ms.
-UPSTREAM_MS = "upstream_ms"
-
-
 class Upstream(Agent):
     """Requests the actions of each batch from the servers of another system.
 
@@ -250,16 +245,14 @@ class Upstream(Agent):
 
         def request(valid: list[tuple[Any, dict[str, Any]]]) -> list[Any]:
             """Return the action of each session, or the error in its place."""
-            begun = time.perf_counter()
-            answers = self._ask(*zip(*valid, strict=True))
-            info = {UPSTREAM_MS: (time.perf_counter() - begun) * 1e3}
 
             def act(answer: Any) -> Any:
                 """Return the action in an answer."""
                 if isinstance(answer, Exception):
                     return answer
-                return Act(self._outgoing.rows(answer), info=info)
+                return Act(self._outgoing.rows(answer))
 
+            answers = self._ask(*zip(*valid, strict=True))
             return [attempt(act, answer) for answer in answers]
 
         inputs = []

@@ -34,7 +34,6 @@ _DEVICE = "device_processor"
 _RENAME = "rename_observations_processor"
 _TOKENIZER = "tokenizer_processor"
 _GROOT_TOKENIZER = "groot_n1_7_vlm_encode_v1"
-_NORMALIZERS = ("normalizer_processor", "unnormalizer_processor")
 _ABSOLUTE = (
     "AbsoluteActionsProcessorStep"  # class in LeRobot 0.6 that adds the state to relative actions
 )
