@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from pushed_weights import check_pushed_weights
 
+from vlagents_ray.errors import ConfigError
 from vlagents_ray_models.openvla.oft import Mlp, OpenVLAOFT, OpenVLAOFTConfig, Parallel, Projector
 
 torch = pytest.importorskip("torch")
@@ -66,3 +67,8 @@ def test_it_acts_with_pushed_parts_by_the_names_of_upstreams_files(policy: OpenV
             return model.head(model.base.network(model.proprio(torch.ones(1, 3)))).numpy()
 
     check_pushed_weights(policy, act)
+
+
+def test_an_adapter_is_rejected_since_its_head_was_trained_with_it() -> None:
+    with pytest.raises(ConfigError, match=r"adapter: expected none, .*got '/runs/a'; merge it"):
+        OpenVLAOFT.from_config({"checkpoint": "none", "adapter": "/runs/a"})

@@ -1,13 +1,10 @@
-"""LoRA adapters over SmolVLA, chosen by session in one batch, against each one merged into a
-checkpoint of its own.
-"""
+"""LoRA adapters over LeRobot's policies, each against the checkpoint into which it was merged."""
 
 from __future__ import annotations
 
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -91,36 +88,14 @@ def write_processors(settings: Any, further: dict[str, Any], *folders: Path) -> 
             pipeline.save_pretrained(folder)
 
 
-@pytest.fixture(scope="module")
-def adapted(made: Made, saved: dict[str, Path]) -> LeRobot:
-    adapters = {name: str(saved[name]) for name in ("expert", "all", "units")}
-    policy = LeRobot.from_config({"checkpoint": str(made("smolvla")), "adapters": adapters})
+def with_adapter(base: Path, adapter: Path | None, **config: Any) -> LeRobot:
+    settings = {} if adapter is None else {"adapter": str(adapter)}
+    policy = LeRobot.from_config({"checkpoint": str(base), **settings, **config})
     policy.initialize()
     return policy
 
 
-def begun_with(policy: LeRobot, number: int, adapter: str | None = None) -> LeRobot:
-    session = AgentCopies(policy).make()
-    session.reset(view(number), TASKS[number % len(TASKS)], seed=number, adapter=adapter)
-    assert isinstance(session, LeRobot)
-    return session
-
-
-@pytest.fixture(scope="module")
-def alone(loaded: Load, saved: dict[str, Path]) -> Callable[[str | None], LeRobot]:
-    """The base, or the whole checkpoint of an adapter."""
-    policies: dict[str | None, LeRobot] = {None: loaded("smolvla")}
-
-    def load(name: str | None) -> LeRobot:
-        if name not in policies:
-            policies[name] = LeRobot.from_config({"checkpoint": str(saved[f"merged/{name}"])})
-            policies[name].initialize()
-        return policies[name]
-
-    return load
-
-
-CHOSEN = ("all", None, "expert", "units", "all", "units")
+ROWS = 4
 
 
 def infos(number: int) -> dict[str, Any]:
@@ -130,15 +105,16 @@ def infos(number: int) -> dict[str, Any]:
     return {SAMPLES: 3 * (number % 2)}
 
 
-def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
-    adapted: LeRobot, alone: Callable[[str | None], LeRobot]
+@pytest.mark.parametrize("name", ["expert", "all", "units"])
+def test_the_policy_acts_as_the_merged_checkpoint(
+    made: Made, loaded: Load, saved: dict[str, Path], name: str
 ) -> None:
-    sessions = [begun_with(adapted, number, name) for number, name in enumerate(CHOSEN)]
-    acts = adapted.act_batch(
-        [view(number, **infos(number)) for number in range(len(CHOSEN))], sessions
-    )
-    for number, (name, act) in enumerate(zip(CHOSEN, acts, strict=True)):
-        expected = begun(alone(name), number).act(view(number, **infos(number)))
+    policy = with_adapter(made("smolvla"), saved[name])
+    merged = with_adapter(saved[f"merged/{name}"], None)
+    sessions = [begun(policy, number) for number in range(ROWS)]
+    acts = policy.act_batch([view(number, **infos(number)) for number in range(ROWS)], sessions)
+    for number, act in enumerate(acts):
+        expected = begun(merged, number).act(view(number, **infos(number)))
         assert isinstance(act, Act)
         np.testing.assert_allclose(act.action, expected.action, atol=ATOL)
         if DISTRIBUTION in expected.info:
@@ -146,52 +122,37 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
                 np.testing.assert_allclose(
                     act.info[DISTRIBUTION][key], expected.info[DISTRIBUTION][key], atol=ATOL
                 )
-        if name is not None:
-            of_base = begun(alone(None), number).act(view(number, **infos(number)))
-            assert np.abs(of_base.action - expected.action).max() > 100 * ATOL
+        of_base = begun(loaded("smolvla"), number).act(view(number, **infos(number)))
+        assert np.abs(of_base.action - expected.action).max() > 100 * ATOL
 
 
-def test_a_learner_pushes_one_of_several_adapters(adapted: LeRobot) -> None:
-    unchanged = (None, "units")
-    before = [begun_with(adapted, 0, name).act(view(0)).action for name in unchanged]
-    check_pushed_weights(adapted, lambda: begun_with(adapted, 0, "all").act(view(0)).action, "all/")
-    for name, action in zip(unchanged, before, strict=True):
-        assert np.array_equal(begun_with(adapted, 0, name).act(view(0)).action, action)
+def test_a_learner_pushes_whole_layers(made: Made, saved: dict[str, Path]) -> None:
+    policy = with_adapter(made("smolvla"), saved["all"])
+    check_pushed_weights(policy, lambda: begun(policy, 0).act(view(0)).action)
 
 
-def test_types_without_a_flow_take_no_adapters(made: Made, saved: dict[str, Path]) -> None:
-    policy = LeRobot.from_config(
-        {"checkpoint": str(made("act")), "adapters": {"expert": str(saved["expert"])}}
+def test_types_without_a_flow_also_accept_an_adapter(
+    made: Made, loaded: Load, tmp_path: Path
+) -> None:
+    network = loaded("act").model.sampler.policy
+    values = pairs(network, layers(network, r"model\..*\.linear\d"), 4)
+    policy = with_adapter(made("act"), save(tmp_path / "act", values))
+    merged = with_adapter(made("act"), None)
+    merge(merged.model.sampler.policy, values)
+    got, expected, of_base = (
+        begun(agent, 0).act(view(0)).action for agent in (policy, merged, loaded("act"))
     )
-    with pytest.raises(
-        ConfigError, match=r"adapters: expected one of LeRobot's \['pi0'.*got 'act'"
-    ):
-        policy.initialize()
+    np.testing.assert_allclose(got, expected, atol=ATOL)
+    assert np.abs(of_base - expected).max() > 100 * ATOL
 
 
-def test_processors_of_another_kind_are_refused(
+def test_one_processor_alone_is_rejected(
     made: Made, saved: dict[str, Path], tmp_path: Path
 ) -> None:
     folder = shutil.copytree(saved["expert"], tmp_path / "expert")
-    file = shutil.copy(made("smolvla") / "policy_preprocessor.json", folder)
-    config = {"checkpoint": str(made("smolvla")), "adapters": {"expert": str(folder)}}
-    with pytest.raises(
-        ConfigError,
-        match=r"adapter 'expert': .*expected both .*got no .*'policy_postprocessor.json'",
-    ):
-        LeRobot.from_config(config).initialize()
-
-    for file_of_base in made("smolvla").glob("policy_*"):
-        shutil.copy(file_of_base, folder)
-    pipeline = json.loads(Path(file).read_text())
-    pipeline["steps"] = [
-        step for step in pipeline["steps"] if step["registry_name"] != "to_batch_processor"
-    ]
-    Path(file).write_text(json.dumps(pipeline))
-    with pytest.raises(
-        ConfigError, match=r"adapter 'expert': .*expected the base's processors.*got other steps"
-    ):
-        LeRobot.from_config(config).initialize()
+    shutil.copy(made("smolvla") / "policy_preprocessor.json", folder)
+    with pytest.raises(ConfigError, match=r"expected both .*got no .*'policy_postprocessor.json'"):
+        with_adapter(made("smolvla"), folder)
 
 
 def arm(control_hz: float) -> DatasetContract:
@@ -214,63 +175,41 @@ def with_contracts(
     """Folders of the adapter "units" with the contract of a dataset, and of "whole", the adapter
     merged into its base.
 
-    "ten", "again" and "whole" have the contract of one dataset, "twenty" of another.
+    "ten" and "whole" have the contract of one dataset, "twenty" of another.
     """
     root = tmp_path_factory.mktemp("contracts")
     settings = loaded("smolvla").model.sampler.policy.config
     folders = {}
-    for name in ("ten", "twenty", "again"):
+    for name in ("ten", "twenty"):
         folders[name] = shutil.copytree(saved["units"], root / name)
     folders["whole"] = shutil.copytree(saved["merged/units"], root / "whole")
-    write_processors(
-        settings, arm(10.0).to_statistics(9), folders["ten"], folders["again"], folders["whole"]
-    )
+    write_processors(settings, arm(10.0).to_statistics(9), folders["ten"], folders["whole"])
     write_processors(settings, arm(20.0).to_statistics(9), folders["twenty"])
     return folders
 
 
-def served(base: Path, adapters: dict[str, Path], **config: Any) -> LeRobot:
-    folders = {name: str(folder) for name, folder in adapters.items()}
-    policy = LeRobot.from_config({"checkpoint": str(base), "adapters": folders, **config})
-    policy.initialize()
-    return policy
-
-
-def test_a_base_without_a_dataset_gets_the_contract_of_its_adapters(
-    made: Made, saved: dict[str, Path], with_contracts: dict[str, Path]
+def test_the_contract_is_that_of_the_adapters_dataset(
+    made: Made, with_contracts: dict[str, Path]
 ) -> None:
-    adapters = {
-        "expert": saved["expert"],
-        "ten": with_contracts["ten"],
-        "again": with_contracts["again"],
-    }
-    policy, alone = served(made("smolvla"), adapters), served(with_contracts["whole"], {})
-    assert alone.contract is not None
-    assert alone.contract.gripper
-    assert policy.contract == alone.contract
+    policy = with_adapter(made("smolvla"), with_contracts["ten"])
+    merged = with_adapter(with_contracts["whole"], None)
+    assert merged.contract is not None
+    assert merged.contract.gripper
+    assert policy.contract == merged.contract
 
     # The first joint is wrapped to 3.18.
     joints = np.linspace(-3.1, 3.1, tiny.STATE - 1).astype(np.float32)
     obs = Obs({"front": view(0).cameras["top"]}, 0.5, {"joints": joints})
     actions = []
-    for agent, name in ((policy, "ten"), (alone, None)):
+    for agent in (policy, merged):
         session = AgentCopies(agent).make()
-        session.reset(obs, TASKS[0], seed=1, adapter=name)
+        session.reset(obs, TASKS[0], seed=1)
         actions.append(session.act(obs).action)
     np.testing.assert_allclose(*actions, atol=ATOL)
 
-
-def test_adapters_of_different_contracts_are_refused(
-    made: Made, with_contracts: dict[str, Path]
-) -> None:
-    with pytest.raises(
-        ConfigError, match=r"adapter 'twenty': .*expected the contract and the names of cameras"
-    ):
-        served(made("smolvla"), {"ten": with_contracts["ten"], "twenty": with_contracts["twenty"]})
-    with pytest.raises(
-        ConfigError, match=r"adapter 'twenty': .*expected the contract and the names of cameras"
-    ):
-        served(with_contracts["whole"], {"twenty": with_contracts["twenty"]})
+    other = with_adapter(with_contracts["whole"], with_contracts["twenty"])
+    assert other.contract is not None
+    assert other.contract.control_hz == 20.0
 
 
 @pytest.mark.parametrize(
@@ -298,22 +237,7 @@ def test_an_adapter_that_was_trained_with_another_network_is_refused(
     folder = shutil.copytree(saved["units"], tmp_path / "units")
     config = json.loads((base / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config))
-    served(base, {"units": folder})
+    with_adapter(base, folder)
     (folder / "config.json").write_text(json.dumps(config | change))
-    with pytest.raises(ConfigError, match=f"adapter 'units': .*{says}"):
-        served(base, {"units": folder})
-
-
-def test_an_adapter_whose_instructions_were_other_tokens_is_refused(
-    made: Made, saved: dict[str, Path], tmp_path: Path
-) -> None:
-    folder = shutil.copytree(saved["units"], tmp_path / "units")
-    file = folder / "policy_preprocessor.json"
-    pipeline = json.loads(file.read_text())
-    steps = {step["registry_name"]: step for step in pipeline["steps"]}
-    steps["tokenizer_processor"]["config"]["max_length"] += 1
-    file.write_text(json.dumps(pipeline))
-    with pytest.raises(
-        ConfigError, match=r"adapter 'units': .*other settings of \['tokenizer_processor'\]"
-    ):
-        served(made("smolvla"), {"units": folder})
+    with pytest.raises(ConfigError, match=says):
+        with_adapter(base, folder)
