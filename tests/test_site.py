@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
@@ -9,8 +10,14 @@ from pathlib import Path
 from urllib.parse import unquote, urldefrag, urljoin
 
 import pytest
+import reference
 from browser import Page, browser
 from eval_fakes import wait_for
+from readme_blocks import options_of
+
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.registry import entries
+from vlagents_ray.serve.config.deployment import ServerArgs
 
 SITE = Path(__file__).parents[1] / "build" / "docs"
 PAGES = [
@@ -60,6 +67,66 @@ def test_every_link_within_the_site_leads_to_a_file_and_an_anchor_in_it() -> Non
                 broken.add(target)
     assert sum(len(links.targets) for links in pages.values()) > len(pages)
     assert broken == set()
+
+
+def text_of(page: str) -> str:
+    """Return the text of a page of the site without tags, which are replaced by spaces."""
+    return html.unescape(re.sub(r"<[^>]*>", " ", (SITE / page).read_text()))
+
+
+def test_the_generated_parts_are_in_the_site() -> None:
+    assert [
+        str(page) for page in SITE.rglob("*.html") if "<!-- generated: " in page.read_text()
+    ] == []
+    for page, expected in (
+        ("install.html", "spacemouse"),
+        ("programs.html", "inspect-robots-franka"),
+        ("policies/verification.html", "transformers 4.57.6"),
+        ("policies/reference.html", "tabletop/pick_place"),
+        ("evaluation/exports.html", "identifies the episode"),
+    ):
+        assert expected in text_of(page), page
+
+
+def test_the_site_has_each_command_with_its_options() -> None:
+    page = (SITE / "reference/cli.html").read_text()
+    text = text_of("reference/cli.html")
+    missing = []
+    for path in reference.help_pages():
+        if path == "vlagents-ray":
+            continue
+        if f'id="{path.replace(" ", "-")}"' not in page:
+            missing.append(path)
+        for option in options_of(path) - {"-h", "--help"}:
+            if not re.search(rf"{option}(?![\w-])", text):
+                missing.append(f"{path} {option}")
+    assert missing == []
+
+
+def test_the_site_has_each_setting_of_a_server_of_a_run_and_of_a_policy() -> None:
+    missing = []
+    for page, model in (("run_file", EvalConfig), ("deployment", ServerArgs)):
+        text = (SITE / f"reference/{page}.html").read_text()
+        for section, _ in reference.sections(model, ""):
+            for name, field in section.model_fields.items():
+                if f"<code>{field.alias or name}</code>" not in text:
+                    missing.append(f"{page}: {field.alias or name}")
+    text = text_of("reference/policies.html")
+    for kind, noun in (("policies", "policy"), ("wrappers", "wrapper")):
+        missing += [name for name in entries(kind) if f"{name} : {noun}" not in text]
+    assert missing == []
+
+
+def test_the_search_knows_the_generated_parts() -> None:
+    index = (SITE / "search/search_index.js").read_text()
+    for expected in (
+        "reference/cli.html#vlagents-ray-serve",
+        "reference/run_file.html#worker",
+        "reference/deployment.html#argsbatch",
+        "reference/policies.html#lerobot-policy",
+        "inspect-robots-franka",
+    ):
+        assert expected in index, expected
 
 
 def test_nothing_of_pythons_own_is_in_the_site() -> None:
