@@ -48,7 +48,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 CONSTRAINTS := $(VENV)/constraints.txt
 STAMP := $(VENV)/.installed
 PROJECTS := pyproject.toml $(PLUGINS:%=plugins/vlagents_ray_%/pyproject.toml)
-# `make check`, `lint`, `type` and `fmt` do with a smaller environment where the whole one is not installed.
+# `make check`, `docs`, `lint`, `type` and `fmt` do with a smaller environment where the whole one is not installed.
 TOOLS := $(if $(wildcard $(STAMP)),$(VENV),$(VENV)-check)
 # On two cores: tests wait for a third of their time, those of `make check` for half of it.
 TEST_PROCESSES ?= 3
@@ -184,11 +184,11 @@ $(VENV)-%/.installed: %.txt tests/requirements/testing.txt $(wildcard $(REQUIREM
 	  $(if $(TORCH_CUDA),--cuda) --out $(VENV)-$*
 	@touch $@
 
-# The reference of Python comes from the sources; for that of commands and settings, docs/hooks.py imports the server and its
-# plug-ins, without torch and simulators.
-docs: $(VENV)-docs/.installed
+# The reference of Python comes from the sources. For that of commands and settings, docs/hooks.py imports the server and its
+# plug-ins, but no torch.
+docs: $(TOOLS)/.installed
 	@echo '== site of docs/, into build/docs'
-	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(TOOLS)/bin/mkdocs build --quiet --strict
 
 extras locks: $(TOOLS)/.installed
 	$(TOOLS)/bin/python tests/support/resolved.py $@ $(ONLY)
@@ -275,14 +275,6 @@ $(VENV)-check/.installed: $(PROJECTS)
 	'$(PYTHON)' -m venv $(VENV)-check
 	@echo '== installing what the quick tests need into $(VENV)-check'
 	$(VENV)-check/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[check]' \
-	  $(foreach plugin,$(PLUGINS),--editable plugins/vlagents_ray_$(plugin))
-	@touch $@
-
-$(VENV)-docs/.installed: $(PROJECTS)
-	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
-	'$(PYTHON)' -m venv $(VENV)-docs
-	@echo '== installing what the site needs into $(VENV)-docs'
-	$(VENV)-docs/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[docs]' \
 	  $(foreach plugin,$(PLUGINS),--editable plugins/vlagents_ray_$(plugin))
 	@touch $@
 

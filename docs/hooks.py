@@ -15,6 +15,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[1]
@@ -30,6 +31,7 @@ PAGES = (
     "CODE_OF_CONDUCT.md",
     "CONTRIBUTING.md",
     "SECURITY.md",
+    "clients/cpp/README.md",
     "examples/README.md",
     "examples/experts/README.md",
     "tests/README.md",
@@ -50,6 +52,11 @@ def on_files(files: Files, config: Any) -> Files:
                 and (ROOT / path).is_file()
                 and path not in files.src_uris
             ):
+                if path.endswith(".md"):
+                    raise PluginError(
+                        f"{file.src_uri} links to {path}: add that page to PAGES of docs/hooks.py, "
+                        "and to mkdocs.yml"
+                    )
                 files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
     return files
 

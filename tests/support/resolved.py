@@ -33,7 +33,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 _PLUGIN_FILES = sorted(ROOT.glob("plugins/vlagents_ray_*/pyproject.toml"))
 PLUGINS = [tomllib.loads(file.read_text())["project"] for file in _PLUGIN_FILES]
 # For Python 3.11 only; "all" installs the plug-ins.
-OF_DEVELOPMENT = {"all", "check", "docs", "dev"}
+OF_DEVELOPMENT = {"all", "check", "dev"}
 # Extras of the plug-ins, with the requirements of their distribution. No two distributions have an
 # extra of the same name.
 OF_PLUGINS: dict[str, list[str]] = {
