@@ -185,10 +185,10 @@ $(VENV)-%/.installed: %.txt tests/requirements/testing.txt $(wildcard $(REQUIREM
 	@touch $@
 
 # The reference of Python comes from the sources. For that of commands and settings, docs/hooks.py imports the server and its
-# plug-ins, but no torch.
+# plug-ins, but no torch. With --quiet, MkDocs would count no warnings, and a strict build would never fail.
 docs: $(TOOLS)/.installed
 	@echo '== site of docs/, into build/docs'
-	NO_MKDOCS_2_WARNING=1 $(TOOLS)/bin/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(TOOLS)/bin/mkdocs build --strict
 
 extras locks: $(TOOLS)/.installed
 	$(TOOLS)/bin/python tests/support/resolved.py $@ $(ONLY)

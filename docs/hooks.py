@@ -18,13 +18,12 @@ from typing import Any
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
-ROOT = Path(__file__).parents[1]
-# The parts are generated from the code, and from the results of tests and measurements.
-sys.path += [str(ROOT / "docs/generate"), str(ROOT / "tests/support")]
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # a warning fails a strict build
-    from generated import filled
+# The generated parts come from the code, and from the results of tests and measurements.
+sys.path.append(str(Path(__file__).parent / "generate"))
+sys.path.append(str(Path(__file__).parents[1] / "tests/support"))
+import generated
 
+ROOT = Path(__file__).parents[1]
 PAGES = (
     "ARCHITECTURE.md",
     "CHANGELOG.md",
@@ -38,6 +37,15 @@ PAGES = (
 )
 _LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<path>(?!\w+:)[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
 _ABOVE_A_BLOCK = re.compile(r"^ *<!--(?:(?!-->).)*-->\n(?= *```)", re.DOTALL | re.MULTILINE)
+
+
+def filled(text: str) -> str:
+    """Return the text of a page with its generated parts, without the warnings of modules that are
+    imported for them.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return generated.filled(text)
 
 
 def on_files(files: Files, config: Any) -> Files:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import html
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -19,7 +21,8 @@ from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.registry import entries
 from vlagents_ray.serve.config.deployment import ServerArgs
 
-SITE = Path(__file__).parents[1] / "build" / "docs"
+ROOT = Path(__file__).parents[1]
+SITE = ROOT / "build" / "docs"
 PAGES = [
     "index.html",
     "tutorials/robot.html",
@@ -52,6 +55,21 @@ class PageLinks(HTMLParser):
         self.anchors.add(values.get("id") or "")
         if tag == "a" and values.get("href"):
             self.targets.add(urljoin(self._page, values["href"]))
+
+
+def test_a_link_that_leads_nowhere_fails_the_build(tmp_path: Path) -> None:
+    """The words after `mkdocs` are those of `make docs`: with --quiet, no warning would count."""
+    pytest.importorskip("mkdocs")
+    [words] = re.findall(r"bin/mkdocs (.+)", (ROOT / "Makefile").read_text())
+    [validation] = re.findall(r"\nvalidation:\n(?:  .*\n)+", (ROOT / "mkdocs.yml").read_text())
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "mkdocs.yml").write_text(f"site_name: a site{validation}")
+    command = [sys.executable, "-m", "mkdocs", *words.split()]
+    for link, leads_nowhere in (("index.md", False), ("nothing.md", True), ("#nothing", True)):
+        (tmp_path / "docs/index.md").write_text(f"# Index\n\n[a page]({link})\n")
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (done.returncode != 0) is leads_nowhere, done.stderr
+        assert (f"'{link}'" in done.stderr) is leads_nowhere
 
 
 def test_every_link_within_the_site_leads_to_a_file_and_an_anchor_in_it() -> None:
