@@ -149,14 +149,6 @@ class EvalOptions:
             help="Episodes whose trajectory is written; default: none.",
         ),
     ] = None
-    record_images: Annotated[
-        str | None,
-        typer.Option(
-            metavar="small|exact",
-            help="Images of the trajectories: compressed with H.264, or exact pixels; default: "
-            "small.",
-        ),
-    ] = None
     track: Annotated[
         str,
         typer.Option(metavar="NAMES", help="Trackers, such as wandb, separated by commas."),
@@ -373,7 +365,7 @@ _PANELS = {
         "retries",
     ),
     "Results": (
-        *("out", "resume", "accept_changes", "video", "record", "record_images"),
+        *("out", "resume", "accept_changes", "video", "record"),
         *("track", "live", "live_at"),
     ),
     "Workers and cluster": ("workers", "cpus", "gpus", "address", "replica_per_gpu"),
@@ -389,8 +381,8 @@ def evaluate_command(options: EvalOptions) -> None:
     intervals and videos.
 
     A run file contains policies, their checkpoints, suites of environments and seeds. --set
-    changes its keys. --out, --workers, --video, --record, --record-images, --track, --retries and
-    --resume override them.
+    changes its keys. --out, --workers, --video, --record, --track, --retries and --resume override
+    them.
 
     Exit status: 0 if every episode has a result; 75 if episodes are left because of --end-at, 130
     if the evaluation was interrupted (continue both with --resume); 2 for invalid settings; 3 if an

@@ -97,9 +97,7 @@ def test_the_same_checkpoint_makes_no_error(tmp_path: Path) -> None:
 def test_another_checkpoint_makes_an_error_by_joint_and_by_step(tmp_path: Path) -> None:
     record(tmp_path)
     with loaded(Brightness(gain=1.5, chunk=3)) as open_session:
-        result = compare(
-            open_datasets(tmp_path), open_session, OpenLoopPlan(batch_size=2)
-        ).to_json()
+        result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()
     assert len(result["by_step"]) == 3, "as many rows as both have"
     assert [one["frames"] for one in result["by_step"]] == [12] * 3
     assert result["by_joint"][1]["joint"] == "action_1"
@@ -243,15 +241,13 @@ def test_an_error_of_the_policy_says_where(tmp_path: Path) -> None:
 
     demonstrate(tmp_path)
     with loaded(Fails()) as open_session, pytest.raises(PolicyFailed, match="episode 0, frame 3"):
-        compare(open_datasets(tmp_path), open_session, OpenLoopPlan(batch_size=1))
+        compare(open_datasets(tmp_path), open_session, OpenLoopPlan())
 
 
 def test_a_server_at_a_url_is_asked_in_the_same_way(tmp_path: Path) -> None:
     record(tmp_path)
     with live_server(Brightness()) as server, candidate(server.url) as open_session:
-        result = compare(
-            open_datasets(tmp_path), open_session, OpenLoopPlan(batch_size=2)
-        ).to_json()
+        result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()
     assert (result["max"], result["frames"]) == (0.0, 12)
 
 

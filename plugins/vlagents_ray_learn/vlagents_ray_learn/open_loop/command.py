@@ -57,12 +57,6 @@ def open_loop_command(
             help="Compare every Nth frame of a dataset without recorded answers.",
         ),
     ] = 1,
-    batch_size: Annotated[
-        int,
-        typer.Option(
-            min=1, max=MOST_ROWS, metavar="N", help="Number of sessions that share a batch."
-        ),
-    ] = 8,
     camera_map: Annotated[
         str | None,
         typer.Option(
@@ -109,7 +103,6 @@ def open_loop_command(
             episodes=None if episodes is None else parse_episodes(episodes),
             horizon=horizon,
             stride=stride,
-            batch_size=batch_size,
             names=names,
         )
         source = find_policy(policy, config_dir)

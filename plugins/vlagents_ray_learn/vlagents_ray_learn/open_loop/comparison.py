@@ -40,6 +40,9 @@ OpenSession = Callable[[], Agent]  # the caller closes the session
 
 FILE = "open_loop.json"
 _WORST_FRAMES = 10  # number of worst frames that the result lists
+# Number of concurrent sessions, which share batches. Every policy has memory for eight rows, and
+# larger batches are hardly faster.
+_SESSIONS = 8
 # Recorded options of a reset that select weights of the recorded policy. Other policies do not have
 # these weights.
 _CHOICES_OF_WEIGHTS = (CHOICE, STEP, OPTION)
@@ -156,7 +159,6 @@ class OpenLoopPlan:
     horizon: int | None = None
     # The distance from one compared frame to the next, in a dataset without recorded answers.
     stride: int = 1
-    batch_size: int = 8  # number of concurrent sessions
     names: Names = field(default_factory=Names)
 
 
@@ -281,7 +283,7 @@ def compare(
         with lock:
             result.sessions += 1
 
-    with ThreadPoolExecutor(plan.batch_size, "open-loop") as threads:
+    with ThreadPoolExecutor(_SESSIONS, "open-loop") as threads:
         futures = [threads.submit(query, session) for session in sessions]
         try:
             for future in futures:
