@@ -309,10 +309,7 @@ def test_the_protocol_has_every_key_header_limit_and_type() -> None:
     keys |= {name for name in dir(messages) if name.endswith("_HEADER")}
     names = {getattr(messages, key, key) for key in keys} - {messages.MACHINE_HEADER}
     types = {np.dtype(code).newbyteorder("<").str.replace("|", "\\|") for code in "?bhiqBHIQefd"}
-    names |= types | {field.name for field in fields(MessageLimits)} - {
-        "reply_bytes",
-        "in_flight_bytes",
-    }
+    names |= types | {field.name for field in fields(MessageLimits)} - {"in_flight_bytes"}
     assert {
         name for name in names if f"`{name}`" not in PROTOCOL and f'"{name}"' not in PROTOCOL
     } == set()

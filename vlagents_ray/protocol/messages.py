@@ -179,7 +179,6 @@ class MessageLimits:
     text: int = 16_384  # length of an instruction
     requests: int = 512  # requests in one frame
     history: int = 256  # observations sent with a reset
-    reply_bytes: int = 16 * 2**20  # size of the action and the info of one reply
     # The decoded size of the images and bytes in one request, counted once for each reference to
     # them.
     decoded_bytes: int = 128 * 2**20
@@ -188,6 +187,9 @@ class MessageLimits:
 
 
 DEFAULT_LIMITS = MessageLimits()
+# The largest action and info of one reply, in bytes. A larger reply would delay those of other
+# sessions.
+REPLY_BYTES = 16 * 2**20
 
 
 @dataclass(frozen=True, slots=True)

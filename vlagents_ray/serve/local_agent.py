@@ -51,7 +51,6 @@ def build_engine(
         version=version_of(args),
         check=args.dialects.require_fit,
         limits=args.limits.call_limits(),
-        reply_bytes=args.limits.reply_bytes,
         in_flight_bytes=args.limits.in_flight_bytes,
         threaded=threaded,
     )

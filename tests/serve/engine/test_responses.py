@@ -14,7 +14,7 @@ from in_flight import pending
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.frames import decode_replies, encode_replies
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits, Reply, Request
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
 from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.engine import responses
 from vlagents_ray.serve.engine.responses import (
@@ -59,7 +59,6 @@ def test_an_act_over_the_limit_fails_and_is_not_counted(act: Act) -> None:
     reply, session = replied(act)
     assert isinstance(reply.error, PolicyFailed)
     assert "expected at most" in str(reply.error)
-    assert "`limits.reply_bytes`" in str(reply.error)
     assert (reply.act, session.steps) == (None, 0)
 
 
@@ -133,11 +132,9 @@ def test_what_no_client_would_read_is_refused_where_it_was_made(
         require_serializable(info)
 
 
-def test_a_deployment_sets_the_limits_as_far_as_clients_read() -> None:
-    assert LimitArgs(reply_bytes=2000).limits().reply_bytes == 2000
+def test_a_deployment_sets_the_limits() -> None:
+    assert LimitArgs(body_bytes=2000).limits().body_bytes == 2000
     assert LimitArgs(act_s=1, warm_up_s=2, load_s=3).call_limits() == CallLimits(1, 2, 3)
-    with pytest.raises(ValueError, match="reply_bytes"):
-        LimitArgs(reply_bytes=MessageLimits().body_bytes + 1)
 
 
 def test_an_error_in_this_process_names_no_server() -> None:

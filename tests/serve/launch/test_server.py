@@ -197,7 +197,7 @@ def test_a_replica_stands_on_each_gpu_unless_the_file_says_otherwise(
         (
             {
                 "resources": {"num_gpus": 1},
-                "autoscaling": {"initial_replicas": 2, "max_replicas": 4},
+                "autoscaling": {"min_replicas": 2, "max_replicas": 4},
             },
             2.0,
         ),

@@ -279,13 +279,6 @@ class LimitArgs(_DeploymentModel):
         le=MOST_BYTES,
         description="Largest body of a request, in bytes.",
     )
-    reply_bytes: int = Field(
-        default=DEFAULT_LIMITS.reply_bytes,
-        ge=1024,
-        le=DEFAULT_LIMITS.body_bytes,  # no client reads a longer reply
-        description="Largest reply: the action and its info, in bytes. A larger result of the "
-        "policy is an error (500).",
-    )
     decoded_bytes: int = Field(
         default=DEFAULT_LIMITS.decoded_bytes,
         ge=1024,
@@ -399,20 +392,14 @@ class AutoscalingArgs(_DeploymentModel):
         default=1,
         ge=0,
         le=MOST_WORKERS,
-        description="Smallest number of replicas. With 0, an unused application has no replica.",
+        description="Smallest number of replicas, and their number at the start. With 0, an unused "
+        "application has no replica.",
     )
     max_replicas: int = Field(
         default=1,
         ge=1,
         le=MOST_WORKERS,
         description="Largest number of replicas.",
-    )
-    initial_replicas: int | None = Field(
-        default=None,
-        ge=0,
-        le=MOST_WORKERS,
-        description="Number of replicas at the start. null: `min_replicas`. `vlagents-ray serve` "
-        "waits until the policy answers, which starts a replica.",
     )
     target_utilisation: float = Field(
         default=0.7,
@@ -606,7 +593,7 @@ class ServerArgs(_DeploymentModel):
         """The number of replicas that start without a request."""
         if self.autoscaling is None:
             return self.replicas or 1
-        return max(self.autoscaling.min_replicas, self.autoscaling.initial_replicas or 0)
+        return self.autoscaling.min_replicas
 
     def code(self) -> tuple[GitState | None, Program]:
         """Return the git state of the policy's code, and the digests of the files of the policy and

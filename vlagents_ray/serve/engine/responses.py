@@ -16,7 +16,7 @@ import numpy as np
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidInput, MessageTooLarge, PolicyFailed, VLAgentsError
 from vlagents_ray.interface import Act
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, REPLY_BYTES, Reply
 from vlagents_ray.protocol.values import ValueWriter
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.requests import PendingRequest
@@ -34,7 +34,7 @@ def build_reply(
     session: Session[LoadedModel],
     result: Act | Exception,
     contract: Contract | None,
-    limit: int = DEFAULT_LIMITS.reply_bytes,
+    limit: int = REPLY_BYTES,
     policy: Mapping[str, Any] = MappingProxyType({}),
 ) -> Reply:
     """Build the reply to an act request, and count the step of its session if the result is valid.
@@ -120,7 +120,7 @@ def timing(pending: PendingRequest, began: float, ended: float) -> dict[str, Any
     return {"queue_ms": (began - pending.arrived) * 1e3, "inference_ms": (ended - began) * 1e3}
 
 
-def require_serializable(info: dict[str, Any], limit: int = DEFAULT_LIMITS.reply_bytes) -> None:
+def require_serializable(info: dict[str, Any], limit: int = REPLY_BYTES) -> None:
     """Check that the info of a reply can be sent, so that an invalid info fails only the session's
     own request.
 
@@ -175,6 +175,4 @@ class _BoundedWriter(ValueWriter):
 
 
 def _too_large(field: str, size: int, limit: int) -> str:
-    return (
-        f"{field}: expected at most {limit} bytes (`limits.reply_bytes`), got {size}; return less"
-    )
+    return f"{field}: expected at most {limit} bytes in a reply, got {size}; return less"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, REPLY_BYTES
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.slo import Slo
 
@@ -33,7 +33,7 @@ class EngineSettings:
     check: Callable[[Contract | None], None] = accept_any
     # Time limits of the policy's calls, above which the engine is unhealthy.
     limits: CallLimits = field(default_factory=CallLimits)
-    reply_bytes: int = DEFAULT_LIMITS.reply_bytes  # maximum size of a reply
+    reply_bytes: int = REPLY_BYTES  # maximum size of a reply
     # Maximum size of all messages in flight together, bytes.
     in_flight_bytes: int = DEFAULT_LIMITS.in_flight_bytes
     # Whether a thread of the engine runs the policy. Otherwise the thread that calls `start` runs
