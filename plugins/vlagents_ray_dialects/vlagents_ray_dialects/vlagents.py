@@ -72,9 +72,7 @@ class VlagentsConnection:
         robot = dialect.config.priority == "robot"
         self._share = share_of(connection)  # the name of the client's share of the bytes in flight
         self._reader = ClientReader(connection, context.admission, robot=robot)
-        self._segments = SharedMemory(
-            same_machine=dialect.config.shared_memory and _is_same_machine(connection)
-        )
+        self._segments = SharedMemory(same_machine=_is_same_machine(connection))
         self._sending = threading.Lock()
         # The sequence number of the request that is being processed.
         self._unanswered: int | None = None
@@ -459,10 +457,6 @@ class VlagentsDialectConfig(KeylessPortConfig):
     )
     robots: dict[str, RobotArgs] = Field(
         default_factory=dict, description="for several robots: the columns of each"
-    )
-    shared_memory: bool = Field(
-        default=True,
-        description="whether the cameras of clients on this machine are read from shared memory",
     )
 
     @model_validator(mode="after")

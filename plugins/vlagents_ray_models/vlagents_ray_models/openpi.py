@@ -416,9 +416,6 @@ class OpenPiConfig(AttentionConfig):
     steps: int | None = Field(
         default=None, ge=1, description="steps of the flow (pi0, pi0.5); unset: openpi's, 10"
     )
-    max_decoding_steps: int = Field(
-        default=256, ge=1, description="largest number of tokens of a chunk (pi0-FAST)"
-    )
     guidance: Guidance = 5.0
     noise_level: NoiseLevel = 0.0
 
@@ -426,6 +423,7 @@ class OpenPiConfig(AttentionConfig):
 logger = logging.getLogger(__name__)
 
 _STEPS = 10  # default of openpi
+_MOST_TOKENS = 256  # tokens of a chunk of π0-FAST, as in openpi
 _END = 1  # PaliGemma's end-of-sequence token
 _LISTED = 5  # largest number of names in a message
 
@@ -598,7 +596,7 @@ class JaxTokens(OpenPiModel):
             return merge(params).sample_actions(
                 jax.random.key(0),
                 _observation(batch),
-                max_decoding_steps=config.max_decoding_steps,
+                max_decoding_steps=_MOST_TOKENS,
             )
 
         self._sample = jax.jit(sample)

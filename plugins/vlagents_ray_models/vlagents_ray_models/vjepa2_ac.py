@@ -65,9 +65,6 @@ class VJepa2AcConfig(ModelConfig):
     image_size: int = Field(
         default=256, ge=16, description="pixels of a side, as the model was trained"
     )
-    normalize: bool = Field(
-        default=True, description="normalise features, as the model was trained"
-    )
 
     execute: int | None = Field(
         default=1, ge=1, description="steps of a plan that are executed; in the paper one"
@@ -78,25 +75,7 @@ class VJepa2AcConfig(ModelConfig):
         default=10, ge=2, description="number of best plans that determine the next distribution"
     )
     iterations: int = Field(default=10, ge=1, description="iterations of the search for a plan")
-    momentum_mean: float = Field(
-        default=0.15, ge=0, lt=1, description="share of the last iteration's mean position"
-    )
-    momentum_std: float = Field(
-        default=0.15, ge=0, lt=1, description="share of the last iteration's deviation of positions"
-    )
-    momentum_mean_gripper: float = Field(
-        default=0.15, ge=0, lt=1, description="share of the last iteration's mean of the gripper"
-    )
-    momentum_std_gripper: float = Field(
-        default=0.15,
-        ge=0,
-        lt=1,
-        description="share of the last iteration's deviation of the gripper",
-    )
     maxnorm: float = Field(default=0.05, gt=0, description="largest step along each axis, m")
-    close_gripper: int | None = Field(
-        default=None, ge=0, description="step of a plan at which the gripper begins to close"
-    )
     pass_size: int = Field(
         default=400, ge=1, description="largest number of plans in a forward pass of the predictor"
     )
@@ -384,6 +363,8 @@ poses (M, T, 7).
 DRAWN = 4  # number of sampled components of an action: x, y, z and the gripper
 _MAX_GRIPPER_CHANGE = 0.75  # largest change of the gripper in a step
 _MIN_GRIPPER_CHANGE = 0.25  # smaller changes become zero
+# Share of the last iteration's mean and deviation, of positions and of the gripper, as upstream.
+_MOMENTUM = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -421,8 +402,6 @@ def plan(
     mean = torch.zeros(len(poses), config.rollout, DRAWN, device=poses.device)
     std = torch.ones_like(mean)
     std[..., :3] = config.maxnorm
-    keep_mean = mean.new_tensor([config.momentum_mean] * 3 + [config.momentum_mean_gripper])
-    keep_std = mean.new_tensor([config.momentum_std] * 3 + [config.momentum_std_gripper])
 
     energy = torch.zeros(len(poses), 0)
     for draws in noise.unbind(1):
@@ -431,8 +410,8 @@ def plan(
         energy = _energies(world, features, poses, goals, actions, config.plans_a_pass)
         best = energy.topk(config.topk, largest=False).indices  # (B, K)
         chosen = samples.gather(2, best[:, None, :, None].expand(-1, config.rollout, -1, DRAWN))
-        mean = chosen.mean(2) * (1 - keep_mean) + mean * keep_mean
-        std = chosen.std(2) * (1 - keep_std) + std * keep_std
+        mean = chosen.mean(2) * (1 - _MOMENTUM) + mean * _MOMENTUM
+        std = chosen.std(2) * (1 - _MOMENTUM) + std * _MOMENTUM
 
     gripper = mean[..., 3:]
     gripper = torch.where(gripper.abs() < _MIN_GRIPPER_CHANGE, 0.0, gripper)
@@ -445,8 +424,6 @@ def _bounded(samples: Tensor, config: VJepa2AcConfig) -> Tensor:
     torch = require("torch")
     position = samples[..., :3].clip(-config.maxnorm, config.maxnorm)
     gripper = samples[..., 3:].clip(-_MAX_GRIPPER_CHANGE, _MAX_GRIPPER_CHANGE)
-    if config.close_gripper is not None:
-        gripper[:, config.close_gripper :] = 1.0
     return torch.cat([position, gripper], -1)
 
 
@@ -559,7 +536,6 @@ class WorldModel:
             name = f"predict frame {frames + 1}"
             self._predictors.append(compilation.core(name, self._predict, config.plans_a_pass))
         self._layer_norm = require("torch").nn.functional.layer_norm
-        self._normalizes = config.normalize
         self._device, self._dtype = encoder.device.type, dtype
         self.staging = Staging(encoder.device)
 
@@ -582,9 +558,7 @@ class WorldModel:
         return self._normalized(encoded.last_hidden_state.float())
 
     def _normalized(self, features: Tensor) -> Tensor:
-        """Return features (…, F), normalised if the model was trained that way."""
-        if not self._normalizes:
-            return features
+        """Return features (…, F), normalised as in training."""
         return self._layer_norm(features, features.shape[-1:])
 
     def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:

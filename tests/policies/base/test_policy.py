@@ -26,7 +26,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
-from vlagents_ray.policies.base.model_inputs import state_specs, state_vector
+from vlagents_ray.policies.base.model_inputs import MOST_SAMPLES, state_specs, state_vector
 from vlagents_ray.policies.base.policy import fastest_split
 from vlagents_ray.policies.loading import report_device
 from vlagents_ray.testing import check_agent
@@ -428,7 +428,7 @@ def test_samples_see_what_their_session_sees() -> None:
         ({}, at(0.0, **{SAMPLES: -1}), InvalidObservation),
         ({"actions": "queue"}, at(0.0, **{SAMPLES: 2}), InvalidObservation),
         ({}, at(0.0, **{SAMPLES: "many"}), InvalidObservation),
-        ({"max_samples": 8}, at(0.0, **{SAMPLES: 9}), InvalidObservation),
+        ({}, at(0.0, **{SAMPLES: MOST_SAMPLES + 1}), InvalidObservation),
         ({}, at(0.0, **{DELAY: "2 ticks"}), InvalidObservation),
         ({}, at(0.0, **{LEFTOVER: np.zeros(3)}), InvalidObservation),
         ({}, at(0.0, **{LEFTOVER: "the plan"}), InvalidObservation),

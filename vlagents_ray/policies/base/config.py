@@ -115,12 +115,6 @@ class ModelConfig(BaseModel, extra="forbid"):
         "2304.13705).",
     )
 
-    max_samples: int = Field(
-        default=1024,
-        ge=0,
-        description="Largest number of samples of its distribution that an observation may "
-        "request.",
-    )
     max_rows: int = Field(
         default=64,
         ge=1,

@@ -27,6 +27,9 @@ KEPT = 256  # number of instructions whose tokens are cached, more than a server
 # Longest instruction that is cached, characters. Since clients choose the instructions, this limits
 # the cache to about 10 MB.
 KEPT_CHARACTERS = 1000
+# Largest number of samples of its distribution that an observation may request, so that one request
+# does not occupy the model for minutes.
+MOST_SAMPLES = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,10 +180,10 @@ def wanted_samples(obs: Obs, config: ModelConfig) -> int:
         InvalidObservation: The policy does not offer so many samples.
     """
     samples = count_in(obs, SAMPLES)
-    if samples > config.max_samples:
+    if samples > MOST_SAMPLES:
         raise InvalidObservation(
-            f"info[{SAMPLES!r}]: expected a number of at most {config.max_samples}, got "
-            f"{samples}; request fewer, or raise the policy's `max_samples`"
+            f"info[{SAMPLES!r}]: expected a number of at most {MOST_SAMPLES}, got {samples}; "
+            "request fewer"
         )
     if samples and config.actions != "chunk":
         raise InvalidObservation(

@@ -98,14 +98,6 @@ def test_small_changes_of_the_gripper_are_none() -> None:
     assert not plans.actions[..., 6].any()
 
 
-def test_a_plan_closes_from_the_step_that_the_config_says() -> None:
-    settings = config(rollout=3, close_gripper=1)
-    start = poses_at([0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 0.0])
-    plans = plan(world, features_at(start), start, features_at(start), noise(settings, 0), settings)
-    assert torch.allclose(plans.actions[0, 1:, 6], torch.ones(2), atol=1e-4)
-    assert plans.actions[0, 0, 6] <= 0.75
-
-
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
