@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import generated
 import pytest
@@ -64,6 +65,11 @@ def test_a_plugin_from_elsewhere_is_on_no_page(monkeypatch: pytest.MonkeyPatch) 
     assert "theirs" not in reference.own_entries("policies")
     assert "reference" in reference.own_entries("policies")
     assert not any("theirs" in row for row in generated.policies())
+    assert any("slurm" in path for path in reference.help_pages())
+    slurm = replace(entries("commands")["slurm"], distribution="theirs-of-others")
+    monkeypatch.setattr(reference, "entries", lambda kind: {**entries(kind), "slurm": slurm})
+    assert not any("slurm" in path for path in reference.help_pages())
+    assert "#vlagents-ray-slurm" not in reference.commands()
 
 
 @pytest.mark.parametrize(

@@ -84,8 +84,13 @@ def own_entries(kind: str) -> dict[str, RegistryEntry]:
 
 def help_pages() -> dict[str, HelpPage]:
     """Return the help of each command; the keys are the words that a user types."""
+    others = {
+        f"vlagents-ray {name}" for name in entries("commands").keys() - own_entries("commands")
+    }
     found: dict[str, HelpPage] = {}
     for path, command in commands_of(get_command(app)):
+        if " ".join(path.split()[:2]) in others:
+            continue
         if path == "vlagents-ray robot":
             parser, _, _ = robot_parser()
             if not isinstance(parser, CommandParser):
@@ -112,8 +117,9 @@ def commands() -> str:
     for panel in main.panels:
         if panel.title != "Options":
             for row in panel.rows:
-                anchor = f"vlagents-ray-{row.term}"
-                rows.append(f"| [`{row.term}`](#{anchor}) | {_cell(row.about)} |")
+                if f"vlagents-ray {row.term}" in found:
+                    link = f"[`{row.term}`](#vlagents-ray-{row.term})"
+                    rows.append(f"| {link} | {_cell(row.about)} |")
     parts = ["\n".join(["| command | purpose |", "|---|---|", *rows]) + "\n"]
     for path, page in found.items():
         parts.append(_command(path, page))
