@@ -205,10 +205,8 @@ class ActorDriver:
 
 
 @contextlib.contextmanager
-def connected(
-    client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()
-) -> Iterator[ProcessDriver]:
-    """Start a client of ours to the server at `url`; `prefix` precedes the client's command."""
+def connected(client: OwnClient, url: str, app: str) -> Iterator[ProcessDriver]:
+    """Start a client of ours to the server at `url`."""
     if client.actor:
         import ray
 
@@ -224,7 +222,7 @@ def connected(
             ray.kill(actor)
         return
     settings = json.dumps({"url": url, "transport": client.transport, "codec": client.codec})
-    command = [*prefix, sys.executable, "-m", "benchmarks.own_clients", settings]
+    command = [sys.executable, "-m", "benchmarks.own_clients", settings]
     with ClientProcess(client.name, command, our_environment()) as child:
         yield child
 

@@ -33,7 +33,6 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
 POLICY = "benchmarks.round_trips:MeasuredNoop"
-LOOPBACK = "127.0.0.1"
 ROUND = 100  # number of calls of one client in its turn
 UNBROKEN = 200  # calls without a break as a number of rounds; they take a second or two
 ON_NODE = ("shm", "plasma")
@@ -135,8 +134,6 @@ def measure(
     *,
     others: Mapping[str, StartClient] | None = None,
     skipped: Mapping[str, str] | None = None,
-    host: str = LOOPBACK,
-    prefix: Sequence[str] = (),
 ) -> RoundTripsOfAll:
     """Measure our clients, and the clients in `others` with their own servers, interleaved."""
     others = others or {}
@@ -146,14 +143,10 @@ def measure(
         save_observation(observation(), obs)
         for name, start in others.items():  # started before Ray, whose start takes longest
             drivers[name] = stack.enter_context(start(obs))
-        # No keys are needed: a host other than loopback is one end of a link that only this run
-        # uses.
-        server = stack.enter_context(
-            running_server(deployment(POLICY), host=host, insecure=host != LOOPBACK)
-        )
+        server = stack.enter_context(running_server(deployment(POLICY)))
         [(app, url)] = server.apps.items()
         for one in own:
-            drivers[one.name] = stack.enter_context(connected(one, url, app, prefix))
+            drivers[one.name] = stack.enter_context(connected(one, url, app))
         if not drivers:
             raise ConfigError("nothing to measure: expected a transport or another server")
         said = {name: driver.ready() for name, driver in drivers.items()}

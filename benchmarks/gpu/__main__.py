@@ -5,8 +5,7 @@ Each step runs in a separate process within a time limit, so that a crash costs 
 limits of the steps fit into the time of a run, and the plan of a run is printed first; further
 steps run while time is left. After each step, the folder `--out` has the results so far: gpu.json,
 gpu.md with tables, and gpu.log with the output of all steps. The exit status is 0 if all criteria
-were met. `--dry` runs the same steps in small sizes on a CPU, and judges no times. `python -m
-benchmarks.gpu.tables` makes the tables of the docs from the results.
+were met. `--dry` runs the same steps in small sizes on a CPU, and judges no times.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from vlagents_ray.protocol.messages import PRIORITIES, Reply, Request
 from vlagents_ray.registry import require
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
-from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
 from vlagents_ray.testing import random_observation
 
@@ -179,15 +177,15 @@ class Lab:
 
     @contextlib.contextmanager
     def engine(self, **changed: Any) -> Iterator[Engine]:
-        """Yield an engine with π0, in CUDA graphs for one and eight rows, and with a second
-        checkpoint that sessions can select. A dry run compiles it only for two rows.
+        """Yield an engine with π0, in CUDA graphs for one and eight rows; a dry run compiles it for
+        two rows only.
         """
         rows = self.size(8, 2)
         # On a CPU, tracing the programs for a size takes longer than everything else in a step.
         batch_sizes = self.size([1, rows], [rows])
         config = self.settings(**{"compile": self.graphs, "batch_sizes": batch_sizes, **changed})
-        offered = Checkpoints(partial(build_agent, "pi0"), config, {"other": {"seed": 1}}, loaded=2)
-        engine = Engine(offered, EngineSettings(max_batch_size=rows, patience=0.1))
+        settings = EngineSettings(max_batch_size=rows, patience=0.1)
+        engine = Engine(build_agent("pi0", config), settings)
         try:
             with self.lines_of("policy", "start"):
                 engine.start()

@@ -20,10 +20,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.checkpoints.recipes import FAMILIES, write_checkpoint
-from benchmarks.gpu.beside_captures import beside_captures
 from benchmarks.gpu.child import child
 from benchmarks.gpu.cold_start import cold_start, cold_starts
-from benchmarks.gpu.fleet import fleet
 from benchmarks.gpu.lab import (
     INSTRUCTION,
     LATE_S,
@@ -307,25 +305,6 @@ def again(lab: Lab) -> None:
     start = cold_start("compiled, kept", config)
     lab.show(starts=[start])
     lab.check("seconds until it acts, with kept programs", start["seconds"], most=60, speed=True)
-
-
-def loading(lab: Lab) -> None:
-    """Load a second checkpoint while sessions act."""
-    with lab.engine() as engine:
-        robots = [Session(engine, seed) for seed in range(lab.size(8, 2))]
-        with Acting([robot.ask for robot in robots]) as acting:
-            alone = acting.during(lambda: time.sleep(lab.size(2, 0)), 2 * len(robots))
-            lab.show(acts=[{"while": "alone", **alone}])
-            with lab.lines_of("checkpoints", "load"):
-                beside = acting.during(lambda: Session(engine, 100, checkpoint="other").ask())
-        lab.show(acts=[{"while": "alone", **alone}, {"while": "a checkpoint loads", **beside}])
-        lab.check("failed acts", beside["failed"], equal=0)
-        lab.check(
-            "longest act, of the longest one without",
-            beside["worst_ms"] / alone["worst_ms"],
-            most=2,
-            speed=True,
-        )
 
 
 def pushes(lab: Lab) -> None:
@@ -748,13 +727,10 @@ STEPS = {
     "numerics": Step(numerics, 130),
     "compiled again": Step(again, 60),
     "served": Step(served, 50),
-    "fleet": Step(fleet, 90),
     "child": Step(child, 45),
     "sharing": Step(sharing, 65),
-    "loading": Step(loading, 30),
     "pushes": Step(pushes, 55),
     "sleep": Step(sleep, 25),
-    "captures": Step(beside_captures, 20),
     "learning": Step(learning, 60),
     "jax": Step(jax_beside, 40),
     "families": Step(families, 90),
@@ -776,7 +752,7 @@ RUNS = {
         ("numerics", "compiled again"),
     ),
     "serving": Run(
-        ("checkpoint", "served", "fleet", "child", "sharing", "loading", "pushes", "sleep"),
-        ("captures", "destruction", "learning", "jax", "families"),
+        ("checkpoint", "served", "child", "sharing", "pushes", "sleep"),
+        ("destruction", "learning", "jax", "families"),
     ),
 }

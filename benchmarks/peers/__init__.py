@@ -26,10 +26,10 @@ import typer
 from benchmarks.drivers import START_S, ClientProcess, ProcessDriver
 from benchmarks.line_process import LineProcess
 from benchmarks.processes import descendants
-from benchmarks.round_trips import LOOPBACK, StartClient
+from benchmarks.round_trips import StartClient
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import requirements_file
-from vlagents_ray.serve.ports import free_port
+from vlagents_ray.serve.ports import LOOPBACK, free_port
 
 SCRIPTS = Path(__file__).parent
 REQUIREMENTS = SCRIPTS / "requirements.txt"
@@ -274,8 +274,6 @@ def serving(
     python: Path,
     running: dict[str, PeerServer],
     policy: Policy,
-    *,
-    host: str = LOOPBACK,
 ) -> Iterator[PeerServer]:
     """Run a peer's server within a context; if `running` has a server that the peer shares, yield
     that server instead.
@@ -283,7 +281,7 @@ def serving(
     if client.script in running:
         yield running[client.script]
         return
-    address = (host, str(free_port(host)))
+    address = (LOOPBACK, str(free_port()))
     with contextlib.ExitStack() as stack:
         process = None
         if client.server:
@@ -305,16 +303,10 @@ def peer_connected(
     python: Path,
     obs: Path,
     running: dict[str, PeerServer],
-    *,
-    host: str = LOOPBACK,
-    prefix: Sequence[str] = (),
 ) -> Iterator[ProcessDriver]:
-    """Run a peer's server on `host` and the peer's client within a context; `prefix` precedes the
-    client's command.
-    """
-    with serving(client, python, running, {}, host=host) as server:
+    """Run a peer's server and the peer's client within a context."""
+    with serving(client, python, running, {}) as server:
         command = [
-            *prefix,
             *client.command(python),
             "drive",
             *server.address,
@@ -327,17 +319,12 @@ def peer_connected(
             yield process
 
 
-def starters(
-    clients: Sequence[PeerClient], python: Path, *, host: str = LOOPBACK, prefix: Sequence[str] = ()
-) -> dict[str, StartClient]:
+def starters(clients: Sequence[PeerClient], python: Path) -> dict[str, StartClient]:
     """Return the starter of each client by its name, for `measure`. The contexts must be exited in
     reverse order.
     """
     running: dict[str, PeerServer] = {}
-    return {
-        one.name: partial(peer_connected, one, python, running=running, host=host, prefix=prefix)
-        for one in clients
-    }
+    return {one.name: partial(peer_connected, one, python, running=running) for one in clients}
 
 
 def set_up(

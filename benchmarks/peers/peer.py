@@ -6,8 +6,6 @@ It imports only the standard library and numpy, as it runs in other environments
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import functools
 import importlib.util
 import json
@@ -17,7 +15,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -71,8 +69,6 @@ class Policy:
         per_item_ms: Additional duration for each row, ms.
         batch: Maximum size of a batch.
         chunk: Number of actions in an answer.
-        accelerator: A file that is locked during a batch. Processes with the same file share an
-            accelerator, which computes for one process at a time.
     """
 
     def __init__(
@@ -81,10 +77,9 @@ class Policy:
         per_item_ms: float = 0.0,
         batch: int = 1,
         chunk: int = 1,
-        accelerator: str | None = None,
     ) -> None:
         self.base_ms, self.per_item_ms, self.batch = base_ms, per_item_ms, batch
-        self.chunk, self.accelerator = chunk, accelerator
+        self.chunk = chunk
         self._busy = threading.Lock()
 
     def __call__(self, rows: int = 1) -> np.ndarray:
@@ -94,32 +89,17 @@ class Policy:
         shape = (rows, 7) if self.chunk == 1 else (rows, self.chunk, 7)
         actions = np.zeros(shape, np.float32)
         actions[..., 0] = rows
-        with self._busy, self._accelerator():
+        with self._busy:
             if taken := self.ms(rows):
                 time.sleep(taken / 1e3)
         return actions
-
-    @contextlib.contextmanager
-    def _accelerator(self) -> Iterator[None]:
-        if self.accelerator is None:
-            yield
-            return
-        with open(self.accelerator, "w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield
 
     def ms(self, rows: int) -> float:
         """Return the duration of a batch, ms."""
         return self.base_ms + self.per_item_ms * rows if self.base_ms or self.per_item_ms else 0.0
 
-    def __reduce__(self) -> tuple[type[Policy], tuple[float, float, int, int, str | None]]:
-        return Policy, (
-            self.base_ms,
-            self.per_item_ms,
-            self.batch,
-            self.chunk,
-            self.accelerator,
-        )
+    def __reduce__(self) -> tuple[type[Policy], tuple[float, float, int, int]]:
+        return Policy, (self.base_ms, self.per_item_ms, self.batch, self.chunk)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,15 +19,14 @@ from typing import Any
 import pytest
 from eval_fakes import wait_for
 
-from benchmarks.gpu import beside_captures as probe
-from benchmarks.gpu import pack, tables
+from benchmarks.gpu import pack
 from benchmarks.gpu import runner as gpu_runner
 from benchmarks.gpu.lab import SECONDS, Acting, Lab, Plan, Step, row_error
 from benchmarks.gpu.runner import Runner, planned_seconds, run_sampled, to_markdown
 from benchmarks.gpu.samples import GpuSamples
 from benchmarks.gpu.steps import GPU_TESTS, RUNS, STEPS
 from benchmarks.network import NetworkTimer, busy_time
-from vlagents_ray.errors import ConfigError, PolicyFailed
+from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.policies.compilation import Compilation
 
 HANG_S = 10  # long enough for a step to begin on a busy machine
@@ -169,7 +168,7 @@ def test_the_plan_is_printed_and_one_that_does_not_fit_is_rejected() -> None:
     plan = subprocess.run([*command, "--plan"], capture_output=True, text=True, check=True).stdout
     assert "served: at most 50 s" in plan
     assert "of 430 s" in plan
-    assert "while time is left: captures, destruction" in plan
+    assert "while time is left: destruction" in plan
     done = subprocess.run(
         [*command, "--seconds", "100"], capture_output=True, text=True, check=False
     )
@@ -260,106 +259,6 @@ def test_the_commit_says_whether_files_have_changed_since(
     assert gpu_runner.commit() == f"{head} with changes"
     (tmp_path / "COMMIT").write_text("packed\n")
     assert gpu_runner.commit() == "packed"
-
-
-def report_of(date: str, commit: str, **figures: Any) -> dict[str, Any]:
-    """Return a report of the step "graphs"."""
-    return {
-        "date": date,
-        "commit": commit,
-        "command": "python -m benchmarks.gpu",
-        "gpu": "NVIDIA H200",
-        "versions": {"torch": "2.11.0"},
-        "dry": False,
-        "steps": {"graphs": {"figures": figures, "checks": []}},
-    }
-
-
-def test_the_tables_of_the_page_have_card_date_and_commit_and_say_what_is_older(
-    tmp_path: Path,
-) -> None:
-    rows = [{"rows": 1, "network_ms": 53.0}]
-    first = report_of("2026-01-01", "aaaa", curve=rows)
-    first["steps"]["eager"] = {"figures": {"curve": rows}, "checks": []}
-    clock = {"clock_mhz": 1755.0, "clock_limited_by": "power cap"}
-    first["steps"]["words"] = {"figures": {"curve": rows, **clock}, "checks": []}
-    kernels = [{"kernel": f"k{i}", "calls": 1, "ms": 1.0, "share": 0.04} for i in range(25)]
-    second = report_of("2026-02-01", "bbbb", **{"curve": rows, "kernels of flow, 1 rows": kernels})
-    second["steps"]["graphs"]["checks"] = [
-        {"name": "ratio", "got": 0.5, "want": "at least 0.9", "passed": False}
-    ]
-    page, latest = tmp_path / "page.md", tmp_path / "latest.json"
-    page.write_text(f"before {tables.BEGIN} old {tables.END} after")
-    for report in (second, first):  # the order of the reports does not matter
-        file = tmp_path / f"{report['commit']}.json"
-        file.write_text(json.dumps(report))
-        tables.main([file], latest, page)
-    text = page.read_text()
-    assert text.startswith("before ")
-    assert text.endswith(" after")
-    assert "in CUDA graphs (NVIDIA H200, torch 2.11.0, 2026-02-01, commit bbbb):" in text
-    older = "2026-01-01, commit aaaa; older than the newest run):"
-    assert older in text
-    assert "(NVIDIA H200, 1755 MHz (limited by power cap), torch 2.11.0, 2026-01-01, " in text
-    assert "| rows | network ms |" in text
-    assert "| k9 | 1 | 1 | 0.04 |" in text
-    assert "k10" not in text
-    assert "- graphs: ratio: 0.5, where at least 0.9 was wanted" in text
-
-    with pytest.raises(ConfigError, match="got a dry run"):
-        tables.merged({}, {**first, "dry": True})
-    for missing in ({"commit": ""}, {"gpu": "no GPU"}):
-        with pytest.raises(ConfigError, match="expected a card and a commit"):
-            tables.merged({}, {**first, **missing})
-    page.write_text("no marks")
-    with pytest.raises(ConfigError, match="expected the marks"):
-        tables.write_page(page, {})
-
-
-def test_the_page_has_the_tables_of_the_latest_figures(tmp_path: Path) -> None:
-    copy = tmp_path / "measured_gpu.md"
-    copy.write_text(tables.PAGE.read_text())
-    tables.write_page(copy, json.loads(tables.LATEST.read_text()))
-    assert copy.read_text() == tables.PAGE.read_text()
-
-
-@pytest.mark.torch
-@pytest.mark.parametrize("disturbs", [True, False])
-def test_replays_beside_captures_report_which_of_them_failed(
-    monkeypatch: pytest.MonkeyPatch, disturbs: bool
-) -> None:
-    torch = pytest.importorskip("torch")
-    from fake_cuda import FakeCuda  # this module needs torch
-
-    cuda = FakeCuda()
-    cuda.install(monkeypatch)
-    monkeypatch.setattr(probe, "fetch", lambda tensor: tensor.values.clone())
-    acts = threading.Event()  # set once an act runs
-    acts_beside = threading.Event()  # set once an act runs while a graph is captured
-    require, run = cuda._require, cuda.run
-
-    def required(index: int) -> None:
-        if threading.current_thread() is not threading.main_thread():
-            acts.set()
-            if cuda.capture is not None:
-                acts_beside.set()
-        if disturbs:
-            require(index)
-
-    def ran(*arguments: Any) -> Any:
-        is_capturing = cuda.capture is not None and cuda.capture.thread == threading.get_ident()
-        assert not (is_capturing and acts.is_set()) or acts_beside.wait(60)
-        return run(*arguments)
-
-    monkeypatch.setattr(cuda, "_require", required)
-    monkeypatch.setattr(cuda, "run", ran)
-    inputs = [cuda.tensor(torch.ones(2, 2)) for _ in range(2)]
-    rows, errors = probe.replays_beside_captures(*inputs, operations=100, seconds=0.2)
-    alone, beside = rows
-    assert alone["failed"] == 0
-    assert alone["acts"] > 0
-    assert beside["failed_captures"] == len(errors)
-    assert (beside["failed"] > 0 or len(errors) > 0) == disturbs
 
 
 @pytest.mark.torch

@@ -1,5 +1,5 @@
-"""Robots that execute the chunks of a policy at their rate: `python -m benchmarks.fleet_robots
-JSON`.
+"""Robots that execute the chunks of a policy at their rate: `python -m benchmarks.robot_process
+JSON`, with a list of `Robot`.
 
 The process connects its robots, and writes "ready". Each line that it then reads is a run,
 {"begin": s, "counted": s, "end": s} of `time.monotonic`; at the end it writes the figures of each
@@ -23,31 +23,24 @@ from typing import Any
 import numpy as np
 
 from benchmarks.own_clients import observation
-from benchmarks.photographs import with_photographs
 from vlagents_ray.chunking.fallback import Cause
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.interface import AGE_MS, CAUSE, CHUNK, REPLAN, SAFE, SLACK, Act, Agent, Obs
+from vlagents_ray.interface import AGE_MS, CAUSE, SAFE, Act, Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.robot.pacing import Pacer
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
-from vlagents_ray.testing import random_observation
 
+OURS, RAY_SERVE, OPENPI = "vlagents_ray", "ray serve", "openpi"
 CONNECT_S = 120.0
-TIMEOUT_S = 20.0
+_TIMEOUT_S = 20.0
 _AGES = 2000  # maximum number of ages of a robot that are written
-_IMAGE_SIZE = 224  # size of cameras for which the contract has no size, px
 _OPENPI_KEYS = {
     "cameras": {"camera_0": "observation/image", "camera_1": "observation/wrist_image"},
     "state": {"joints": "observation/state"},
     "instruction": "prompt",
-}
-_VLAGENTS_KEYS = {
-    "cameras": {name: f"robot/cameras/{name}" for name in ("camera_0", "camera_1")},
-    "state": {"joints": "robot/joints"},
-    "instruction": "language_instruction",
 }
 
 
@@ -56,45 +49,10 @@ class Robot:
     """One robot."""
 
     url: str
+    system: str  # one of `OURS`, `RAY_SERVE` and `OPENPI`
     hz: float
     chunk: int  # number of rows in an answer
-    # Maximum number of rows of an answer that the robot executes; None for all.
-    rows: int | None = None
-    way: str = "websocket"  # transport of our client; otherwise "openpi", "vlagents" or "ray serve"
-    states_slack: bool = True  # whether the robot reports how long it can wait for an answer
-    real_time_chunking: bool = False
-    age_ms: float | None = None  # maximum age of an action in the robot's SLO
-    share: float = 0.98  # share of ticks in time in the robot's SLO
-    # Whether the observations fit the contract of the policy; otherwise they have two cameras and
-    # seven joints.
-    fits_contract: bool = False
-
-
-class WithoutSlack(Agent):
-    """Our client as it was before servers used slack."""
-
-    def __init__(self, agent: Agent) -> None:
-        self._agent = agent
-
-    @property
-    def contract(self) -> Contract | None:
-        return self._agent.contract
-
-    def initialize(self) -> None:
-        self._agent.initialize()
-
-    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
-        kwargs.pop("slo", None)
-        return self._agent.reset(obs, instruction, **kwargs)
-
-    def act(self, obs: Obs) -> Act:
-        info = {key: value for key, value in obs.info.items() if key != SLACK}
-        act = self._agent.act(replace(obs, info=info))
-        act.info.pop(REPLAN, None)
-        return act
-
-    def close(self) -> None:
-        self._agent.close()
+    rows: int  # maximum number of rows of an answer that the robot executes
 
 
 class RayServeClient(Agent):
@@ -117,7 +75,7 @@ class RayServeClient(Agent):
         packed = {
             name: (array.tobytes(), str(array.dtype), array.shape) for name, array in arrays.items()
         }
-        answer = self._connection.post(self._url, msgpack.packb(packed), timeout=TIMEOUT_S)
+        answer = self._connection.post(self._url, msgpack.packb(packed), timeout=_TIMEOUT_S)
         answer.raise_for_status()
         return Act(np.frombuffer(answer.content, np.float32).reshape(self._chunk, 7))
 
@@ -127,25 +85,24 @@ class RayServeClient(Agent):
 
 def connect(robot: Robot) -> Agent:
     """Return the client of a robot, not connected yet."""
-    if robot.way == "ray serve":
+    if robot.system == RAY_SERVE:
         return RayServeClient(robot.url, robot.chunk)
-    if robot.way in ("openpi", "vlagents"):
+    if robot.system == OPENPI:
         settings = {
-            "protocol": robot.way,
+            "protocol": "openpi",
             "urls": [robot.url],
-            "mapping": _OPENPI_KEYS if robot.way == "openpi" else _VLAGENTS_KEYS,
+            "mapping": _OPENPI_KEYS,
             "contract": {"action": {"dim": 7, "delta": True}, "chunk": robot.chunk},
-            "timeout_s": TIMEOUT_S,
+            "timeout_s": _TIMEOUT_S,
         }
         return build_agent("upstream", settings)
-    agent = RemoteAgent(
+    return RemoteAgent(
         robot.url,
-        transport=robot.way,  # type: ignore[arg-type]
+        transport="websocket",
         codec="jpeg",
-        timeout_s=TIMEOUT_S,
+        timeout_s=_TIMEOUT_S,
         connect_timeout_s=CONNECT_S,
     )
-    return agent if robot.states_slack else WithoutSlack(agent)
 
 
 class RunningRobot:
@@ -153,23 +110,10 @@ class RunningRobot:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        agent = connect(robot)
-        contract = agent.contract
-        is_relative = contract is not None and bool(contract.action.relative)
-        settings = PlayerSettings(
-            mode="async",
-            horizon=robot.rows,
-            real_time_chunking=robot.real_time_chunking,
-            timeout_s=TIMEOUT_S,
-            # The arm does not move, but the player rejects actions that do not fit the contract.
-            safe="zero" if is_relative else "hold",
-        )
-        self._player = ChunkPlayer(agent, settings)
+        settings = PlayerSettings(mode="async", horizon=robot.rows, timeout_s=_TIMEOUT_S)
+        self._player = ChunkPlayer(connect(robot), settings)
         self._player.initialize()
         self._obs = observation()
-        if robot.fits_contract:
-            obs = random_observation(agent.contract, seed=0, image_size=_IMAGE_SIZE)
-            self._obs = with_photographs(obs, seed=0)
 
     def run(self, begin: float, counted: float, end: float) -> dict[str, Any]:
         """Run from a random moment within a period after `begin` until `end`, and return the
@@ -177,66 +121,46 @@ class RunningRobot:
 
         Args:
             begin: The beginning of the episode; all times are s of `time.monotonic`.
-            counted: The time since which ticks are counted, as the figures of a starting fleet
-                differ from those of a running fleet.
+            counted: The time since which ticks are counted, as the figures of robots that have just
+                started together differ from later figures.
             end: The end of the run.
         """
-        robot = self._robot
-        slo = {"hz": robot.hz, "age_ms": robot.age_ms, "share": robot.share}
-        known = {key: value for key, value in slo.items() if value is not None}
-        options = {"slo": known} if robot.way in ("websocket", "http", "shm") else {}
-        time.sleep(max(0.0, begin + random.uniform(0, 1 / robot.hz) - time.monotonic()))
+        hz = self._robot.hz
+        time.sleep(max(0.0, begin + random.uniform(0, 1 / hz) - time.monotonic()))
         failed = ""
         ages: list[float] = []
-        resumed: set[int] = set()  # number of chunks before which the session had to begin again
-        # Times of starved ticks, s after `begin`, and their numbers.
-        late: list[tuple[float, int]] = []
         try:
-            reset = self._player.reset(replace(self._obs, info={}), "measure", **options)
+            self._player.reset(replace(self._obs, info={}), "measure")
         except VLAgentsError as error:
-            return {
-                "ticks": 1,
-                "starved": 1,
-                "missed": 0,
-                "ages": [],
-                "late": [],
-                "resumed": 0,
-                "failed": str(error),
-            }
+            return {"ticks": 1, "late": 1, "missed": 0, "ages": [], "failed": str(error)}
 
         # A robot holds still while it waits for its first answer.
         waited_s = max(0.0, min(time.monotonic(), end) - counted)
-        ticks = starved = round(waited_s * robot.hz)
-        pacer = Pacer(robot.hz)
+        ticks = late = round(waited_s * hz)
+        pacer = Pacer(hz)
         missed_before = 0
         while (now := time.monotonic()) < end:
-            tick = pacer.wait()
+            pacer.wait()
             act = self._player.act(replace(self._obs, info={}))
             if now < counted:
                 missed_before = pacer.missed
                 continue
 
             ticks += 1
-            if act.info.get("resumed"):
-                resumed.add(act.info[CHUNK])
             if SAFE not in act.info:
                 ages.append(act.info[AGE_MS])
                 continue
-            starved += 1
-            late.append((time.monotonic() - begin, tick))
+            late += 1
             cause: Cause = act.info[CAUSE]
             if cause not in ("waiting", "late"):
                 failed = act.info[SAFE]
         missed = pacer.missed - missed_before
         return {
             "ticks": ticks + missed,
-            "starved": starved + missed,
+            "late": late + missed,
             "missed": missed,
             "ages": ages if len(ages) <= _AGES else random.sample(ages, _AGES),
-            "late": late,
-            "resumed": len(resumed),
             "failed": failed,
-            "slo": reset.get("slo"),
         }
 
     def close(self) -> None:

@@ -1,0 +1,313 @@
+"""Counts the ticks in time of robots behind this server, plain Ray Serve, and openpi's server.
+
+Robots run in separate processes. Each has two 224x224 RGB cameras, executes a row of its newest
+chunk at each tick, and requests the next chunk in the background. The ticks do not wait for the
+server: a tick without a row is late. A robot is in time if at least 98 % of its ticks are. All
+robots use the same chunk player.
+
+The policy takes the time of a real one without computing: a batch of n takes `base + row * n` ms,
+one batch at a time, as on one GPU; by default these are the times of π0 on an H200. From these
+times follows the capacity: the number of robots that the policy could serve if all batches were
+full and nothing else took time. Each system runs with a number of robots below and above it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from benchmarks import peers as others
+from benchmarks.console import Out, Seconds, save, show_skipped
+from benchmarks.figures import measured_on
+from benchmarks.line_process import LineProcess, our_environment
+from benchmarks.peers.peer import wait_for_port
+from benchmarks.robot_process import CONNECT_S, OPENPI, OURS, RAY_SERVE, Robot
+from vlagents_ray.cli.console import errors, out, progress, table
+from vlagents_ray.cli.options import parse_list
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
+
+SYSTEMS = (OURS, RAY_SERVE, OPENPI)
+# Rows of an answer that robots execute, which take turns, by the name of a fleet.
+FLEETS: Mapping[str, Sequence[int]] = {"8": (8,), "50": (50,), "mixed": (8, 50)}
+IN_TIME = 0.98  # minimum share of the ticks of a robot that is in time
+_CLIENTS = {RAY_SERVE: "Ray Serve HTTP", OPENPI: "openpi"}  # clients by the names in `peers`
+_SCHEMES = {RAY_SERVE: "http", OPENPI: "ws"}
+_AHEAD_S = 0.5
+_LATE_S = 90.0
+_ROBOTS_A_PROCESS = 16
+
+
+@dataclass(frozen=True, slots=True)
+class RobotsPlan:
+    """The settings of `measure_robots`."""
+
+    systems: Sequence[str] = SYSTEMS
+    fleets: Sequence[str] = ("8",)  # names in `FLEETS`
+    loads: Sequence[float] = (0.7, 1.05)  # numbers of robots, relative to the capacity
+    hz: float = 10.0
+    # Duration of a batch, and additional duration of each row, ms; those of π0 on an H200,
+    # compiled.
+    base_ms: float = 29.3
+    row_ms: float = 8.06
+    batch: int = 16  # largest batch
+    warm: float = 10.0  # time before each measurement, s, as all robots start at once
+    seconds: float = 20.0  # duration of each measurement, s
+    # Python interpreter of the other systems.
+    python: Path = field(default=others.PYTHON)
+
+    def capacity(self, fleet: str) -> float:
+        """Return the number of robots that the policy could serve in time with the best size of its
+        batches.
+
+        A request waits for the running batch and for its own. A robot therefore needs the next
+        chunk two batches before the end of its rows.
+        """
+        most = 0.0
+        for size in range(1, self.batch + 1):
+            batch_s = (self.base_ms + self.row_ms * size) / 1e3
+            intervals_s = [rows / self.hz - 2 * batch_s for rows in FLEETS[fleet]]
+            if min(intervals_s) > 0:
+                requests_hz = float(np.mean([1 / interval_s for interval_s in intervals_s]))
+                most = max(most, size / batch_s / requests_hz)
+        return most
+
+
+def measure_robots(
+    plan: RobotsPlan, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Any]:
+    """Measure all systems with all fleets and loads; returns plain JSON values."""
+    clients, reasons, versions = others.peer_clients(["all"], plan.python)
+    installed = {client.name: client for client in clients}
+    peers = {client.name: client.peer for client in others.PEER_CLIENTS}
+    points: list[dict[str, Any]] = []
+    skipped: dict[str, str] = {}
+    for system in plan.systems:
+        client = _CLIENTS.get(system)
+        if client is not None and client not in installed:
+            skipped[system] = reasons[peers[client]]
+            continue
+        for fleet in plan.fleets:
+            with _serving(plan, system, max(FLEETS[fleet]), installed) as url:
+                for load in plan.loads:
+                    point = _point(plan, system, url, fleet, load)
+                    points.append(point)
+                    progress(
+                        f"{system}: {point['robots']} robots, {point['in_time']} in time, "
+                        f"{point['share']:.1%} of the ticks"
+                    )
+    settings = {**asdict(plan), "python": str(plan.python)}
+    return {"plan": settings, "points": points, "skipped": skipped, "versions": versions}
+
+
+@contextlib.contextmanager
+def _serving(
+    plan: RobotsPlan, system: str, chunk: int, installed: Mapping[str, others.PeerClient]
+) -> Iterator[str]:
+    """Run the server of a system within a context, and yield its URL."""
+    costs = {"base_ms": plan.base_ms, "per_item_ms": plan.row_ms}
+    if system == OURS:
+        most = max(plan.loads) * max(plan.capacity(fleet) for fleet in plan.fleets)
+        served = deployment(
+            "noop",
+            config={**costs, "chunk": chunk, "delta": True},
+            batch={"max_size": plan.batch},
+            sessions={"limit": 2 * round(most)},
+        )
+        with running_server(served) as server:
+            yield server.url
+        return
+
+    policy = {**costs, "batch": plan.batch, "chunk": chunk}
+    with others.serving(installed[_CLIENTS[system]], plan.python, {}, policy) as peer:
+        host, port = peer.address
+        wait_for_port(host, int(port))
+        yield f"{_SCHEMES[system]}://{host}:{port}"
+
+
+def _point(plan: RobotsPlan, system: str, url: str, fleet: str, load: float) -> dict[str, Any]:
+    """Measure one number of robots."""
+    kinds = FLEETS[fleet]
+    count = max(1, round(load * plan.capacity(fleet)))
+    robots = [
+        Robot(url, system, plan.hz, max(kinds), kinds[number % len(kinds)])
+        for number in range(count)
+    ]
+    figures = _run(robots, plan.warm, plan.seconds)
+    return {
+        "system": system,
+        "fleet": fleet,
+        "load": load,
+        "robots": count,
+        **summary(figures),
+        "failed": sorted({robot["failed"] for robot in figures if robot["failed"]}),
+    }
+
+
+def _run(robots: Sequence[Robot], warm: float, seconds: float) -> list[dict[str, Any]]:
+    """Run robots in separate processes, which all begin at the same time, and return the figures of
+    each.
+
+    Args:
+        robots: The robots.
+        warm: The time before the measurement, s.
+        seconds: The length of the measurement, s.
+    """
+    with contextlib.ExitStack() as stack:
+        processes = []
+        for first in range(0, len(robots), _ROBOTS_A_PROCESS):
+            some = [asdict(robot) for robot in robots[first : first + _ROBOTS_A_PROCESS]]
+            command = [sys.executable, "-m", "benchmarks.robot_process", json.dumps(some)]
+            processes.append(stack.enter_context(LineProcess("robots", command, our_environment())))
+        for process in processes:
+            process.read(CONNECT_S)
+        begin = time.monotonic() + _AHEAD_S
+        counted = begin + warm
+        times = {"begin": begin, "counted": counted, "end": counted + seconds}
+        for process in processes:
+            process.send(json.dumps(times))
+        figures: list[dict[str, Any]] = []
+        for process in processes:
+            figures += process.read(warm + seconds + _LATE_S)
+        return figures
+
+
+def summary(robots: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the figures of some robots: the number of robots in time, the shares of ticks in time,
+    and the ages of actions, ms.
+    """
+    shares = [1 - robot["late"] / max(1, robot["ticks"]) for robot in robots]
+    ticks = max(1, sum(robot["ticks"] for robot in robots))
+    ages = np.concatenate([robot["ages"] for robot in robots])
+    if not len(ages):
+        ages = np.array([np.nan])
+    p50, p99 = (float(age) for age in np.quantile(ages, (0.5, 0.99)))
+    return {
+        "in_time": sum(share >= IN_TIME for share in shares),
+        "share": 1 - sum(robot["late"] for robot in robots) / ticks,
+        "least_share": min(shares),
+        # Ticks that the robot's own process began too late, as the machine was busy.
+        "missed": sum(robot["missed"] for robot in robots) / ticks,
+        "age_p50_ms": p50,
+        "age_p99_ms": p99,
+    }
+
+
+def show_robots(measured: Mapping[str, Any]) -> None:
+    """Print a row for each system, fleet and load."""
+    rows = table(
+        "system",
+        "rows of a chunk",
+        "robots",
+        "of the capacity",
+        "robots in time",
+        "ticks in time",
+        "of the worst robot",
+        "missed by the robots",
+        "age p50 ms",
+        "p99",
+    )
+    for point in measured["points"]:
+        rows.add_row(
+            point["system"],
+            point["fleet"],
+            str(point["robots"]),
+            f"{point['load']:.0%}",
+            str(point["in_time"]),
+            f"{point['share']:.1%}",
+            f"{point['least_share']:.1%}",
+            f"{point['missed']:.1%}",
+            f"{point['age_p50_ms']:.0f}",
+            f"{point['age_p99_ms']:.0f}",
+        )
+    out.print(rows)
+    for point in measured["points"]:
+        for reason in point["failed"]:
+            out.print(f"{point['system']}, {point['robots']} robots: {reason}")
+    show_skipped(measured)
+
+
+def parse_names(text: str, option: str, known: Sequence[str]) -> list[str]:
+    """Parse a comma-separated list of names."""
+    names = parse_list(text)
+    if unknown := [name for name in names if name not in known]:
+        raise ConfigError(f"{option}: expected only {list(known)}, got {unknown}")
+    return names
+
+
+def parse_numbers(text: str, option: str, separator: str) -> list[float]:
+    """Parse a list of numbers above 0."""
+    try:
+        numbers = [float(number) for number in text.split(separator)]
+    except ValueError as error:
+        raise ConfigError(
+            f"{option}: expected numbers that are separated by {separator!r}, got {text!r}"
+        ) from error
+    if min(numbers) <= 0:
+        raise ConfigError(f"{option}: expected numbers above 0, got {text!r}")
+    return numbers
+
+
+def main(
+    systems: Annotated[
+        str, typer.Option(help=f"Some of {', '.join(SYSTEMS)}, separated by commas.")
+    ] = ",".join(SYSTEMS),
+    chunks: Annotated[
+        str,
+        typer.Option(help="Rows that a robot executes of a chunk: some of 8, 50 and mixed."),
+    ] = "8",
+    loads: Annotated[
+        str, typer.Option(help="Numbers of robots, as shares of the capacity.")
+    ] = "0.7,1.05",
+    times: Annotated[
+        str, typer.Option(help="Duration of a batch and of each row, BASE:ROW in ms.")
+    ] = "29.3:8.06",
+    warm: Annotated[
+        float,
+        typer.Option(min=0, help="Seconds before each measurement, as all robots start at once."),
+    ] = 10.0,
+    seconds: Seconds = 20.0,
+    peers_python: others.PeersPython = others.PYTHON,
+    out_file: Out = None,
+) -> None:
+    """Count the ticks in time of robots at 10 Hz behind each system."""
+    with errors():
+        durations = parse_numbers(times, "--times", ":")
+        if len(durations) != 2:
+            raise ConfigError(f"--times: expected BASE:ROW, got {times!r}")
+        plan = RobotsPlan(
+            systems=parse_names(systems, "--systems", SYSTEMS),
+            fleets=parse_names(chunks, "--chunks", tuple(FLEETS)),
+            loads=parse_numbers(loads, "--loads", ","),
+            base_ms=durations[0],
+            row_ms=durations[1],
+            warm=warm,
+            seconds=seconds,
+            python=peers_python,
+        )
+        for fleet in plan.fleets:
+            if plan.capacity(fleet) < 1:
+                raise ConfigError(
+                    f"--times: expected durations with which one robot with --chunks {fleet} is in "
+                    f"time, got {times}"
+                )
+        origin = measured_on("python -m benchmarks.robots")
+        measured = measure_robots(plan, progress)
+        show_robots(measured)
+        save(
+            {**origin, **measured, "versions": origin["versions"] | measured["versions"]}, out_file
+        )
+
+
+if __name__ == "__main__":
+    typer.run(main)
