@@ -15,8 +15,10 @@ from __future__ import annotations
 
 import contextlib
 import json
+import socket
 import sys
 import time
+import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -28,8 +30,7 @@ import typer
 from benchmarks import peers as others
 from benchmarks.console import Out, Seconds, save, show_skipped
 from benchmarks.figures import measured_on
-from benchmarks.line_process import LineProcess, our_environment
-from benchmarks.peers.peer import wait_for_port
+from benchmarks.line_process import LineProcess, ProcessFailed, our_environment
 from benchmarks.robot_process import CONNECT_S, OPENPI, OURS, RAY_SERVE, Robot
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import parse_list
@@ -45,6 +46,8 @@ _CLIENTS = {RAY_SERVE: "Ray Serve HTTP", OPENPI: "openpi"}  # clients by the nam
 _SCHEMES = {RAY_SERVE: "http", OPENPI: "ws"}
 _AHEAD_S = 0.5
 _LATE_S = 90.0
+# For a server that starts: time limit of an answer, and time between two attempts, s.
+_ANSWER_S, _POLL_S = 5.0, 0.1
 _ROBOTS_A_PROCESS = 16
 
 
@@ -130,9 +133,31 @@ def _serving(
 
     policy = {**costs, "batch": plan.batch, "chunk": chunk}
     with others.serving(installed[_CLIENTS[system]], plan.python, {}, policy) as peer:
-        host, port = peer.address
-        wait_for_port(host, int(port))
-        yield f"{_SCHEMES[system]}://{host}:{port}"
+        _wait_until_ready(peer, system)
+        yield "{}://{}:{}".format(_SCHEMES[system], *peer.address)
+
+
+def _wait_until_ready(peer: others.PeerServer, system: str) -> None:
+    """Wait until a server listens, and, if it is Ray Serve, until its replica answers.
+
+    Raises:
+        ProcessFailed: The server has ended, or is not ready in time.
+    """
+    host, port = peer.address
+    deadline = time.monotonic() + others.READY_S
+    while time.monotonic() < deadline:
+        if peer.process is not None:
+            peer.process.require_running()
+        try:
+            if system == RAY_SERVE:
+                urllib.request.urlopen(f"http://{host}:{port}/", timeout=_ANSWER_S).close()
+            else:
+                socket.create_connection((host, int(port)), timeout=_ANSWER_S).close()
+        except OSError:
+            time.sleep(_POLL_S)
+        else:
+            return
+    raise ProcessFailed(f"{system}: not ready within {others.READY_S:g} s")
 
 
 def _point(plan: RobotsPlan, system: str, url: str, fleet: str, load: float) -> dict[str, Any]:

@@ -42,12 +42,6 @@ _ON_ONE_MACHINE = {
     "*vlagents, shared memory*": "*vlagents shm*",
     "*OpenVLA REST*": "*OpenVLA REST*",
 }
-_OVER_THE_LINK = {
-    "WebSocket, default": "websocket, default",
-    "HTTP, JPEG": "http, jpeg",
-    "*vlagents, JPEG*": "*vlagents JPEG*",
-    "*openpi*": "*openpi*",
-}
 _ENVIRONMENTS = (DOCS / "python_environments.md").read_text()
 BLOCKS = re.findall(r"```yaml\n(applications:.*?)```", _ENVIRONMENTS, re.DOTALL)
 
@@ -332,18 +326,15 @@ def test_each_dialect_is_shown_among_the_clients_of_other_systems() -> None:
 
 
 def test_the_figures_of_the_readme_are_the_measured_ones() -> None:
-    own, link = re.split(r"Round trips of one call over a link", _read("measured_tables.md"))
-    for table, names, row in (
-        (own, _ON_ONE_MACHINE, r"^\| {} \| (\S+) \|"),
-        (link, _OVER_THE_LINK, r"\| {} \| (\S+) \|$"),
-    ):
-        measured = dict(re.findall(r"^\| (\S[^|]*?) \| (\d+\.\d+) \(", table, re.MULTILINE))
-        for shown, name in names.items():
-            [figure] = re.findall(row.format(re.escape(shown)), README, re.MULTILINE)
-            assert f"{float(measured[name]):.{len(figure.partition('.')[2])}f}" == figure, shown
+    measured = dict(
+        re.findall(r"^\| (\S[^|]*?) \| (\d+\.\d+) \(", _read("measured.md"), re.MULTILINE)
+    )
+    for shown, name in _ON_ONE_MACHINE.items():
+        [figure] = re.findall(rf"^\| {re.escape(shown)} \| (\S+) \|$", README, re.MULTILINE)
+        assert f"{float(measured[name]):.{len(figure.partition('.')[2])}f}" == figure, shown
 
 
-# Rows of docs/alternatives.md, and the rows of docs/measured_tables.md that they quote.
+# Rows of docs/alternatives.md, and the rows of docs/measured.md that they quote.
 _ALTERNATIVES = {
     "this server, shared memory": "shm",
     "this server, WebSocket": "websocket, default",
@@ -360,8 +351,8 @@ _ALTERNATIVES = {
 
 
 def test_the_figures_of_the_alternatives_are_the_measured_ones() -> None:
-    table, _, _ = _read("measured_tables.md").partition("CPU time of the same calls")
-    rows = [[cell.strip() for cell in line.split("|")[1:]] for line in table.splitlines()]
+    lines = _read("measured.md").splitlines()
+    rows = [[cell.strip() for cell in line.split("|")[1:]] for line in lines]
     measured = {row[0]: row for row in rows if len(row) > 4}
     quoted = re.findall(
         r"^\| ([^|]+) \| ([\d.]+) \| ([^|]+) \|$", _read("alternatives.md"), re.MULTILINE
@@ -372,7 +363,7 @@ def test_the_figures_of_the_alternatives_are_the_measured_ones() -> None:
         median_ms = float(row[1].partition(" ")[0])
         digits = len(round_trip_ms.partition(".")[2])
         assert f"{median_ms:.{digits}f}" == round_trip_ms, name
-        assert row[4].partition(" ")[0] in (actions_a_second, ""), name
+        assert row[3].partition(" ")[0] in (actions_a_second, ""), name
 
 
 def test_the_pictures_are_those_that_their_script_draws() -> None:
