@@ -328,9 +328,7 @@ class StoredPolicy(Watcher):
         self.weights_id = self.declared_id
 
 
-@pytest.mark.parametrize(
-    "declared_id", [None, {"digest": "mine", "revision": "c0ffee", "adapters": {}}]
-)
+@pytest.mark.parametrize("declared_id", [None, {"digest": "mine", "revision": "c0ffee"}])
 def test_the_weights_are_those_of_the_policy_and_of_the_parts(
     declared_id: dict[str, Any] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,6 +17,7 @@ from pushed_weights import check_pushed_weights
 from plugins.vlagents_ray_models.tests.families.pi0.conftest import WORDS, made, seen
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
+from vlagents_ray.policies.loading import LoadingReport
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray_models.pi0 import Pi0
 
@@ -80,6 +81,22 @@ def test_the_policy_acts_as_its_base_with_merged_weights(
                 act.info[DISTRIBUTION]["samples"], expected.info[DISTRIBUTION]["samples"], atol=ATOL
             )
         assert np.abs(expected.action - of_base.action).max() > 100 * ATOL
+
+
+def test_products_of_a_network_with_an_adapter_are_merged_on_a_gpu(
+    folder: Path,
+    saved: tuple[Path, dict[str, np.ndarray]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    expected = [act.action for act in acts_of(made(folder, adapter=str(saved[0])))]
+    monkeypatch.setattr(LoadingReport, "accelerated", True)
+    monkeypatch.setattr(Pi0, "_warm_up", lambda _, **__: None)
+    policy = made(folder, adapter=str(saved[0]))
+    attention = policy.loaded().network.model.vlm.language_model.layers[0].self_attn
+    memory = attention.q_proj.weight.untyped_storage()
+    assert memory.data_ptr() == attention.k_proj.weight.untyped_storage().data_ptr()
+    actions = [act.action for act in acts_of(policy)]
+    np.testing.assert_allclose(actions, expected, atol=ATOL)
 
 
 def test_a_learner_pushes_whole_layers(

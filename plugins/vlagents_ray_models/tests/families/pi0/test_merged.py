@@ -72,11 +72,8 @@ def test_it_acts_with_the_weights_of_a_file_that_is_loaded_into_it(
         torch.testing.assert_close(value, weights[name], rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("settings", "is_merged"),
-    [({}, True), ({"adapters": {"any": "folder"}}, False), ({"quantization": "int8"}, False)],
-)
-def test_single_layers_stay_apart_for_adapters_and_quantization(
+@pytest.mark.parametrize(("settings", "is_merged"), [({}, True), ({"quantization": "int8"}, False)])
+def test_single_layers_stay_apart_for_quantization(
     folder: Path, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], is_merged: bool
 ) -> None:
     calls: list[Pi0] = []
@@ -85,7 +82,6 @@ def test_single_layers_stay_apart_for_adapters_and_quantization(
         calls.append(policy)
 
     monkeypatch.setattr(Pi0, "merge_products", note_call)
-    monkeypatch.setattr(Pi0, "_load_with_adapters", Pi0.load)
     monkeypatch.setattr(Pi0, "_warm_up", lambda _, **__: None)
     monkeypatch.setattr(base_policy, "quantize", lambda *_: None)
     made(folder, **settings)
