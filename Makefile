@@ -91,6 +91,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.rtt --peers all --out build/bench/rtt.json
 	$(BIN)/python -m benchmarks.throughput --peers all --out build/bench/throughput.json
 	$(BIN)/python -m benchmarks.evaluation --peers all --out build/bench/evaluation.json
+	$(BIN)/python -m benchmarks.robots --out build/bench/robots.json
 
 # GPU_PYTHON is one with torch and transformers. With DRY=1 the steps run in small sizes on a CPU. COMMIT names the commit in a
 # copy without a git folder.

@@ -182,7 +182,6 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
         "rich",
         "grpc",
     ),
-    "bench": ("matplotlib",),
     "sim": ("gymnasium",),
     "record": ("av", "pyarrow"),
     "otel": ("opentelemetry",),

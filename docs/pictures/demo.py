@@ -3,7 +3,8 @@ policy to four simulated robots, films the live page and one of the robots, eval
 and writes demo.gif.
 
 The policy receives images of 64 px, as in its training. The same actions are applied to a second
-environment with the same seed, whose larger images are shown. The script needs Chromium.
+environment with the same seed, whose larger images are shown. The script needs Chromium, and
+matplotlib for its fonts.
 """
 
 from __future__ import annotations
