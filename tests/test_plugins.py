@@ -17,7 +17,14 @@ from vlagents_ray.cli.listing import policies_and_wrappers
 from vlagents_ray.cli.main import app
 from vlagents_ray.cli.results import settings_of_export
 from vlagents_ray.errors import ConfigError, UnknownEnv, UnknownPolicy
-from vlagents_ray.registry import entries, find_entry, names, not_installed, plugin_distributions
+from vlagents_ray.registry import (
+    RegistryEntry,
+    entries,
+    find_entry,
+    names,
+    not_installed,
+    plugin_distributions,
+)
 from vlagents_ray.robot.leaders import leader_named
 from vlagents_ray.robot.loop import robot_factory
 
@@ -157,14 +164,12 @@ def write(results, path, *, limit: int = 3, columns: list[str]) -> int:
 """
 
 
-def test_a_format_of_a_plugin_has_the_settings_of_its_function(
+def test_a_format_of_the_user_has_the_settings_of_its_function(
     install: Install, tmp_path: Path
 ) -> None:
     (tmp_path / "lab_policies" / "export.py").write_text(EXPORT)
-    with (tmp_path / "lab_policies" / "registry.py").open("a") as file:
-        file.write("EXPORT = RegistryEntry('lab_policies.export:write', 'rows of the lab')\n")
-    install("lab-policies", exports="lab = lab_policies.registry:EXPORT")
-    export = registry.registered_function("exports", "lab")
+    install("lab-policies")
+    export = registry.registered_function("exports", "lab_policies.export:write")
     assert settings_of_export("lab", export, ["limit=2", "columns=[env]"]) == {
         "limit": 2,
         "columns": ["env"],
@@ -199,10 +204,11 @@ def test_a_name_of_a_plugin_that_is_not_installed_is_an_error_that_names_it(
     published = {
         "envs": {"shelf": "vlagents-ray-shelf"},
         "policies": {"pi9": "vlagents-ray-models"},
-        "exports": {"hdf9": "vlagents-ray-tables"},
-        "trackers": {"notebook9": "vlagents-ray-tables"},
     }
     monkeypatch.setattr(registry, "published", lambda: published)
+    absent = RegistryEntry("no_such_tables:Any", distribution="vlagents-ray-tables")
+    monkeypatch.setitem(registry.EXPORTS, "hdf9", absent)
+    monkeypatch.setitem(registry.TRACKERS, "notebook9", absent)
     with pytest.raises(
         UnknownEnv, match="'shelf' is in vlagents-ray-shelf, which is not installed: pip install"
     ):
@@ -213,6 +219,10 @@ def test_a_name_of_a_plugin_that_is_not_installed_is_an_error_that_names_it(
         registry.registered_function("exports", "hdf9")
     with pytest.raises(ConfigError, match="tracker 'notebook9' is in vlagents-ray-tables"):
         registry.registered_class("trackers", "notebook9")
+    assert "hdf9" not in entries("exports")
+    assert not_installed("exports") == {"hdf9": "vlagents-ray-tables"}
+    with pytest.raises(ConfigError, match="a page is in vlagents-ray-tables, which is not inst"):
+        registry.function_in_plugin("a page", absent.target, absent.distribution)
     [listed] = [row for row in policies_and_wrappers() if row.name == "pi9"]
     assert listed.what == "in vlagents-ray-models"
     assert (
@@ -226,6 +236,13 @@ def test_all_plugins_of_this_repository_are_installed_for_its_tests() -> None:
         assert not_installed(kind) == {}, "make setup"
         for name in names(kind):
             assert find_entry(kind, name) is not None
+
+
+@pytest.mark.parametrize("kind", ["exports", "trackers", "leaders"])
+def test_what_this_package_names_in_plugins_of_this_repository_is_there(kind: str) -> None:
+    assert not_installed(kind) == {}, "make setup"
+    for name in names(kind):
+        assert callable(registry.registered_function(kind, name))
 
 
 ROBOTS = """
@@ -243,8 +260,8 @@ class Lamp:
 class Pedal:
     help = "press it"
 
-    def __init__(self, step):
-        self.step, self.open = step, True
+    def __init__(self):
+        self.open = True
 
     def __enter__(self):
         return self
@@ -258,10 +275,6 @@ class Pedal:
     def action(self, obs): ...
 
 
-def open_pedal(contract, *, step, measure):
-    return Pedal(step)
-
-
 def inspect(arguments):
     print("inspecting", *arguments)
     return 7
@@ -269,21 +282,21 @@ def inspect(arguments):
 ROBOT_REGISTRY = """
 ARM = RegistryEntry("lab_policies.robots:Arm", "the arm of the lab", tasks=":<name>")
 LAMP = RegistryEntry("lab_policies.robots:Lamp")
-PEDAL = RegistryEntry("lab_policies.robots:open_pedal", "a pedal")
 INSPECT = RegistryEntry("lab_policies.robots:inspect", "Inspect the arm.")
 """
 
 
 @pytest.fixture
 def lab(install: Install, tmp_path: Path) -> None:
-    """Install a distribution with a robot, a leader and a subcommand of `vlagents-ray robot`."""
+    """Install a distribution with a robot and a subcommand of `vlagents-ray robot`, and a class of
+    a leader.
+    """
     (tmp_path / "lab_policies" / "robots.py").write_text(ROBOTS)
     with (tmp_path / "lab_policies" / "registry.py").open("a") as file:
         file.write(ROBOT_REGISTRY)
     install(
         "lab-robots",
         robots="arm = lab_policies.registry:ARM\nlamp = lab_policies.registry:LAMP",
-        leaders="pedal = lab_policies.registry:PEDAL",
         commands="robot.inspect = lab_policies.registry:INSPECT",
     )
 
@@ -299,9 +312,10 @@ def test_a_robot_of_a_plugin_is_made_by_its_name_with_the_text_after_the_colon()
 
 
 @pytest.mark.usefixtures("lab")
-def test_a_leader_of_a_plugin_is_opened_by_its_name_and_closed() -> None:
-    with leader_named("--teleop", "pedal")(None, step=0.5, measure=None) as leader:
-        assert (leader.step, leader.open) == (0.5, True)  # type: ignore[attr-defined]
+def test_a_leader_of_the_user_is_opened_by_the_name_of_its_class_and_closed() -> None:
+    opened = leader_named("--teleop", "lab_policies.robots:Pedal")(None, step=0.5, measure=None)
+    with opened as leader:
+        assert leader.open  # type: ignore[attr-defined]
     assert not leader.open  # type: ignore[attr-defined]
 
 
@@ -317,7 +331,7 @@ def test_a_subcommand_of_a_plugin_gets_its_arguments_and_is_no_command_of_its_ow
     for name, about in (
         ("inspect", "Inspect the arm."),
         ("arm:<name>", "the arm of the lab"),
-        ("pedal", "a pedal"),
+        ("keyboard", "the keys of the terminal as six axes and a gripper"),
     ):
         assert re.search(rf"^  {name} +{about}$", listed, re.MULTILINE), name
     assert not [command.name for command in app.registered_commands if "." in str(command.name)]
@@ -328,8 +342,9 @@ def test_a_robot_a_leader_and_a_subcommand_that_are_not_installed_name_their_dis
 ) -> None:
     published = {
         "robots": {"crane": "vlagents-ray-cranes"},
-        "leaders": {"wheel": "vlagents-ray-cranes"},
     }
+    wheel = RegistryEntry("no_such_cranes:open_wheel", distribution="vlagents-ray-cranes")
+    monkeypatch.setitem(registry.LEADERS, "wheel", wheel)
     published["commands"] = {"robot.lift": "vlagents-ray-cranes"}
     monkeypatch.setattr(registry, "published", lambda: published)
     with pytest.raises(

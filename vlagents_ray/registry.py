@@ -3,9 +3,10 @@ location of their code, and their requirements.
 
 Each name belongs to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add
 entries through the entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`,
-`.robots`, `.leaders`, `.commands`, `.replica`, `.pages`, `.exports` and `.trackers`: an entry point
-names a `RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a deployment
-file works without registration. Wrappers change the observations of any policy, or its actions.
+`.robots`, `.commands` and `.replica`: an entry point names a `RegistryEntry` in a module that
+imports nothing large. Formats of exports, trackers and operators' devices are named here, also
+those in this project's plug-ins. A `"module:Class"` works without registration. Wrappers change the
+observations of any policy, or its actions.
 
 The tables of README and docs/ are made from these entries.
 """
@@ -23,6 +24,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import metadata, resources
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
@@ -41,6 +43,7 @@ from vlagents_ray.naming import did_you_mean
 logger = logging.getLogger(__name__)
 
 CORE = "vlagents-ray"  # the distribution of this package
+_RESULTS, _ROBOT = "vlagents-ray-results", "vlagents-ray-robot"  # distributions of plug-ins
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +138,61 @@ WRAPPERS: dict[str, RegistryEntry] = {
 EXPORTS: dict[str, RegistryEntry] = {
     "json": RegistryEntry("vlagents_ray.evaluate.exports:to_json", "an object for each episode"),
     "csv": RegistryEntry("vlagents_ray.evaluate.exports:to_csv", "a line for each episode"),
+    "parquet": RegistryEntry(
+        "vlagents_ray_results.parquet:to_parquet",
+        "a typed row for each episode",
+        distribution=_RESULTS,
+    ),
+    "lerobot": RegistryEntry(
+        "vlagents_ray_results.lerobot:to_lerobot",
+        "a LeRobotDataset v3.0 of the observations and actions, in a new folder",
+        distribution=_RESULTS,
+    ),
 }
+
+# Trackers of `eval --track`: classes like `evaluate.trackers.TrackerRun`.
+TRACKERS: dict[str, RegistryEntry] = {
+    "wandb": RegistryEntry(
+        "vlagents_ray_results.trackers:WandbRun",
+        "Weights & Biases",
+        needs=("wandb",),
+        extra="wandb",
+        distribution=_RESULTS,
+    ),
+    "trackio": RegistryEntry(
+        "vlagents_ray_results.trackers:TrackioRun",
+        "Trackio",
+        needs=("trackio",),
+        extra="trackio",
+        distribution=_RESULTS,
+    ),
+    "tensorboard": RegistryEntry(
+        "vlagents_ray_results.trackers:TensorboardRun",
+        "TensorBoard",
+        needs=("tensorboard",),
+        extra="tensorboard",
+        distribution=_RESULTS,
+    ),
+}
+
+# Operators' devices of `robot --teleop`: functions like `robot.leaders.OpenLeader`.
+LEADERS: dict[str, RegistryEntry] = {
+    "keyboard": RegistryEntry(
+        "vlagents_ray_robot.teleoperation:open_keyboard",
+        "the keys of the terminal as six axes and a gripper",
+        distribution=_ROBOT,
+    ),
+    "spacemouse": RegistryEntry(
+        "vlagents_ray_robot.teleoperation:open_spacemouse",
+        "the cap of a SpaceMouse as six axes and a gripper",
+        needs=("pyspacemouse",),
+        extra="spacemouse",
+        distribution=_ROBOT,
+    ),
+}
+
+# The kinds of names that any plug-in may register: each is an entry-point group.
+_GROUPS = ("policies", "wrappers", "envs", "dialects", "robots", "commands", "replica")
 
 _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "policies": POLICIES,
@@ -143,14 +200,13 @@ _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "envs": ENVS,
     "dialects": {},  # other systems' protocols, the names under `dialects` in a deployment file
     "robots": {},  # the names before the colon of `vlagents-ray robot --robot NAME:ARGUMENT`
-    "leaders": {},  # operators' devices, `vlagents-ray robot --teleop NAME`
     # This package's own commands are in `cli.main`; "robot.NAME" is a subcommand of `vlagents-ray
     # robot`.
     "commands": {},
     "replica": {},  # parts of a replica
-    "pages": {},  # web pages that show an evaluation while it runs
+    "leaders": LEADERS,
     "exports": EXPORTS,
-    "trackers": {},  # classes like `evaluate.trackers.TrackerRun`
+    "trackers": TRACKERS,
 }
 _SINGULAR = {
     "policies": "policy",
@@ -161,7 +217,6 @@ _SINGULAR = {
     "leaders": "leader",
     "commands": "command",
     "replica": "part of a replica",
-    "pages": "page of evaluations",
     "exports": "export format",
     "trackers": "tracker",
 }
@@ -349,19 +404,20 @@ def names(kind: str) -> list[str]:
     first.
     """
     built_in = _BUILT_IN[kind]
-    return [*built_in, *sorted(name for name in _entry_points(kind) if name not in built_in)]
+    installed = [name for name, entry in built_in.items() if _is_installed(entry)]
+    return [*installed, *sorted(name for name in _entry_points(kind) if name not in built_in)]
 
 
 def find_entry(kind: str, name: str) -> RegistryEntry | None:
     """Return the entry of a name that this package or a plug-in registers; None if the name is not
-    registered.
+    registered, or is in a plug-in that is not installed.
 
     Raises:
         ConfigError: The plug-in's entry cannot be loaded, or several plug-ins register the name.
     """
     built_in = _BUILT_IN[kind].get(name)
     if built_in is not None:
-        return built_in
+        return built_in if _is_installed(built_in) else None
     points = _entry_points(kind).get(name)
     return None if points is None else _load(points)
 
@@ -388,7 +444,15 @@ def target_of(kind: str, name: str) -> str:
     return name if entry is None else entry.target
 
 
+def _is_installed(entry: RegistryEntry) -> bool:
+    """Return whether the package of an entry can be imported, without importing it."""
+    package = entry.target.partition(":")[0].partition(".")[0]
+    return entry.distribution == CORE or find_spec(package) is not None
+
+
 def _entry_points(kind: str) -> Mapping[str, tuple[EntryPoint, ...]]:
+    if kind not in _GROUPS:
+        return {}
     return _installed_entry_points(f"vlagents_ray.{kind}", tuple(sys.path))
 
 
@@ -442,7 +506,7 @@ def _distribution_of(point: EntryPoint) -> str:
 def plugin_distributions() -> list[str]:
     """Return the installed distributions that register names, without this package."""
     distributions = set()
-    for kind in _BUILT_IN:
+    for kind in _GROUPS:
         for points in _entry_points(kind).values():
             distributions |= {_distribution_of(point) for point in points if point.dist is not None}
     return sorted(distributions)
@@ -462,8 +526,12 @@ def not_installed(kind: str) -> dict[str, str]:
     """Return the names of `kind` in plug-ins of the project that are not installed, with their
     distributions.
     """
+    distributions = dict(published().get(kind, {}))
+    for name, entry in _BUILT_IN[kind].items():
+        if entry.distribution != CORE:
+            distributions[name] = entry.distribution
     installed = names(kind)
-    return {name: dist for name, dist in published().get(kind, {}).items() if name not in installed}
+    return {name: dist for name, dist in distributions.items() if name not in installed}
 
 
 def policy_class(name: str) -> type[Any]:
@@ -522,6 +590,29 @@ def registered_function(kind: str, name: str) -> Any:
     return load_target(_importable_target(kind, name, ConfigError))
 
 
+def function_in_plugin(what: str, target: str, distribution: str) -> Any:
+    """Return a function of one of this project's plug-ins, which this package calls by its name.
+
+    Args:
+        what: The function's purpose, for the error.
+        target: "module:function".
+        distribution: The distribution of the plug-in.
+
+    Raises:
+        ConfigError: The plug-in is not installed.
+    """
+    if not _is_installed(RegistryEntry(target, distribution=distribution)):
+        raise ConfigError(_absent(what, distribution))
+    return load_target(target)
+
+
+def _absent(what: str, distribution: str) -> str:
+    return (
+        f"{what} is in {distribution}, which is not installed: "
+        f"{pip_install(distribution=distribution)}"
+    )
+
+
 def _importable_target(kind: str, name: str, unknown: type[ConfigError]) -> str:
     """Return the target of a registered name, and check that it can be imported; "module:NAME" is
     returned unchanged.
@@ -533,10 +624,7 @@ def _importable_target(kind: str, name: str, unknown: type[ConfigError]) -> str:
     if ":" not in target:
         distribution = not_installed(kind).get(name)
         if distribution is not None:
-            raise unknown(
-                f"{_SINGULAR[kind]} {_shown(kind, name)!r} is in {distribution}, which is not "
-                f"installed: {pip_install(distribution=distribution)}"
-            )
+            raise unknown(_absent(f"{_SINGULAR[kind]} {_shown(kind, name)!r}", distribution))
         known = names(kind)
         raise unknown(
             f"expected one of {sorted(known)}, or 'module:Class', got {name!r}, which is not "

@@ -42,7 +42,7 @@ from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, require_installed,
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
 from vlagents_ray.policies.noop import Noop
-from vlagents_ray.registry import pip_install
+from vlagents_ray.registry import CORE, pip_install
 
 WORDS = ["eval", "tabletop", "--policy", "http://127.0.0.1:9"]
 
@@ -247,11 +247,11 @@ def test_options_that_cannot_hold_are_refused_before_anything_starts(
 def test_a_page_whose_plugin_is_not_installed_is_named_before_anything_starts(
     monkeypatch: pytest.MonkeyPatch, words: list[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(registry, "_entry_points", lambda _: {})
+    monkeypatch.setattr(registry, "_is_installed", lambda entry: entry.distribution == CORE)
     message = said(
         "eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words
     )
-    assert "page of evaluations 'live' is in vlagents-ray-live, which is not installed" in message
+    assert "page of evaluations is in vlagents-ray-live, which is not installed" in message
     assert pip_install(distribution="vlagents-ray-live") in message
     assert not (tmp_path / "out").exists()
 

@@ -138,7 +138,6 @@ def registered() -> Iterator[str]:
         "robots",
         "leaders",
         "replica",
-        "pages",
         "exports",
         "trackers",
     )

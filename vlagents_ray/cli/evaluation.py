@@ -7,7 +7,8 @@ from __future__ import annotations
 import contextlib
 import datetime
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,6 @@ from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
-from vlagents_ray.evaluate.report.evaluation_page import EvaluationPage
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.report.terminal import LineProgress
 from vlagents_ray.evaluate.results.database import FILE
@@ -50,7 +50,7 @@ from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_ca
 from vlagents_ray.evaluate.run import evaluate_plan
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.ray_tools.private import node_of_this_process
-from vlagents_ray.registry import registered_class
+from vlagents_ray.registry import function_in_plugin, registered_class
 from vlagents_ray.serve.access.api_keys import load_keys, require_watch_keys
 from vlagents_ray.serve.launch.deployment_file import own_settings
 from vlagents_ray.serve.models.checkpoints import CHOICE
@@ -59,7 +59,6 @@ from vlagents_ray.serve.ports import LOOPBACK, is_free
 POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a case
 LOOK_S = 1.0  # the period at which the folder of checkpoints is read
 _PORT = 8050  # preferred port of the live page
-_PAGE = "live"  # the name of the live page in the registry
 
 
 def live_address(at: str | None) -> tuple[str, int]:
@@ -75,7 +74,7 @@ def live_address(at: str | None) -> tuple[str, int]:
         ConfigError: The plug-in with the page is not installed, or other machines could reach the
             page without a key.
     """
-    registered_class("pages", _PAGE)
+    _server_of_page()
     if at is None:
         return LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0
     try:
@@ -138,13 +137,22 @@ def follow(results: Path, address: tuple[str, int]) -> None:
         threading.Event().wait()
 
 
+def _server_of_page() -> Callable[..., AbstractContextManager[str]]:
+    """Return the function that serves the live page, `serve_evaluation` of its plug-in."""
+    target = "vlagents_ray_live.live_evaluation_page:serve_evaluation"
+    server: Callable[..., AbstractContextManager[str]] = function_in_plugin(
+        "the live page of evaluations", target, "vlagents-ray-live"
+    )
+    return server
+
+
 @contextlib.contextmanager
 def _page(
     document: ResultsDocument, apps: Sequence[str], address: tuple[str, int]
 ) -> Iterator[None]:
     """Serve the live page within the context, and print its URL."""
-    page: EvaluationPage = registered_class("pages", _PAGE)()
-    with page.serve(document, apps, address, load_keys()) as url:
+    serve = _server_of_page()
+    with serve(document, apps, address, load_keys()) as url:
         out.print(f"live: {url}")
         yield
 

@@ -41,8 +41,7 @@ class TrackedPolicy:
 
 
 class TrackerRun(Protocol):
-    """A run in a tracker. Plug-ins register trackers in the entry-point group
-    `vlagents_ray.trackers`.
+    """The interface of a run in a tracker. `track` of an evaluation names its class.
 
     The methods may raise any error; the caller handles it.
     """

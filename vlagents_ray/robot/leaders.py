@@ -25,8 +25,7 @@ Measure = Callable[[Obs], np.ndarray]  # returns the robot's pose from an observ
 
 
 class OpenLeader(Protocol):
-    """The interface of a function that opens an operator's device; plug-ins register it in
-    `vlagents_ray.leaders`.
+    """The interface of a function that opens an operator's device.
 
     A leader may have an attribute `help`, a line that explains how to use the device; the command
     line prints this line.

@@ -1,6 +1,4 @@
-"""The entries that this distribution registers: one for each part of a replica, and one for the
-page of evaluations.
-"""
+"""The entries that this distribution registers, one for each part of a replica."""
 
 from vlagents_ray.registry import RegistryEntry
 
@@ -8,11 +6,6 @@ LIVE = RegistryEntry(
     "vlagents_ray_live.part:LivePart",
     "Shows the sessions on a page, `/live`, and stops their robots from there.",
     by_default=True,
-)
-
-EVALUATION_PAGE = RegistryEntry(
-    "vlagents_ray_live.live_evaluation_page:LiveEvaluationPage",
-    "Shows an evaluation while it runs: `eval --live`, `report --live`.",
 )
 
 RECORD = RegistryEntry(

@@ -1,6 +1,4 @@
-"""The entries that this distribution registers: one for each command, format of exports, and
-tracker.
-"""
+"""The entries that this distribution registers, one for each command."""
 
 from vlagents_ray.registry import RegistryEntry
 
@@ -21,22 +19,4 @@ VERIFY = RegistryEntry(
     "vlagents_ray_results.commands:verify_command",
     "Check a bundle, and print what is equal or differs.",
     examples=("verify first.bundle.zip", "verify first.bundle.zip --replay 10 --out runs/check"),
-)
-
-PARQUET = RegistryEntry("vlagents_ray_results.parquet:to_parquet", "a typed row for each episode")
-LEROBOT = RegistryEntry(
-    "vlagents_ray_results.lerobot:to_lerobot",
-    "a LeRobotDataset v3.0 of the observations and actions, in a new folder",
-)
-WANDB = RegistryEntry(
-    "vlagents_ray_results.trackers:WandbRun", "Weights & Biases", needs=("wandb",), extra="wandb"
-)
-TRACKIO = RegistryEntry(
-    "vlagents_ray_results.trackers:TrackioRun", "Trackio", needs=("trackio",), extra="trackio"
-)
-TENSORBOARD = RegistryEntry(
-    "vlagents_ray_results.trackers:TensorboardRun",
-    "TensorBoard",
-    needs=("tensorboard",),
-    extra="tensorboard",
 )

@@ -1,6 +1,4 @@
-"""The entries that this distribution registers: one for each robot, operator's device and
-command.
-"""
+"""The entries that this distribution registers, one for each robot and command."""
 
 from vlagents_ray.registry import RegistryEntry
 
@@ -26,18 +24,6 @@ ROS = RegistryEntry(
     needs=("yaml",),
     extra="ros",
     tasks=":<file>",
-)
-
-KEYBOARD = RegistryEntry(
-    "vlagents_ray_robot.teleoperation:open_keyboard",
-    "the keys of the terminal as six axes and a gripper",
-)
-
-SPACEMOUSE = RegistryEntry(
-    "vlagents_ray_robot.teleoperation:open_spacemouse",
-    "the cap of a SpaceMouse as six axes and a gripper",
-    needs=("pyspacemouse",),
-    extra="spacemouse",
 )
 
 CHECK = RegistryEntry(
