@@ -43,7 +43,6 @@ __all__ = [
     "ChecksHealth",
     "ContinuesPlans",
     "CountsTicks",
-    "DefersLoading",
     "Forwards",
     "HasCheck",
     "HasControl",
@@ -205,23 +204,6 @@ class Sleeps(InProcess, Protocol):
     def wake(self) -> None:
         """Allocate the memory that `sleep` freed; torch tensors of `parameters` are still the same
         objects, but at other addresses.
-        """
-
-
-@runtime_checkable
-class DefersLoading(InProcess, Protocol):
-    """The policy can postpone a part of its loading, which would delay the actions of other
-    policies on the same GPU.
-    """
-
-    def load_deferred(self) -> bool:
-        """Do one part of the postponed loading.
-
-        A server that loads this policy next to others calls this between two batches, when no
-        policy has received a request for some seconds.
-
-        Returns:
-            Whether more parts are left.
         """
 
 

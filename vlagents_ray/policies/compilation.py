@@ -24,7 +24,6 @@ import warnings
 from bisect import insort
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -310,10 +309,6 @@ class CudaGraph:
 
 
 CompileMode = bool | Literal["auto", "graphs", "max", "require"]
-Scope = Literal["all", "parts", "wholes"]
-"""The cores whose programs are made: all cores, cores without parts ("parts"), or cores with
-parts ("wholes").
-"""
 
 
 def uses_torch_compile(mode: CompileMode) -> bool:
@@ -371,10 +366,6 @@ class Compilation:
         self.rows_of_regions: int | None = None
         self.sizes: list[int] = []  # batch sizes for which a core is compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made
-        self.scope: Scope = "all"  # cores whose programs are being made
-        # Batch sizes for which the programs of cores with parts are not made yet, from the largest
-        # to the smallest.
-        self.deferred: list[int] = []
         # The tier of the parts that a core calls; None outside of the context `parts`.
         self.tier_of_parts: str | None = None
         self.cores: list[Core] = []
@@ -462,7 +453,7 @@ class Compilation:
         )
         return program
 
-    def add_size(self, size: int, forward: Callable[[], object], *, defers: bool = False) -> None:
+    def add_size(self, size: int, forward: Callable[[], object]) -> None:
         """Make the programs of all cores for a batch size.
 
         The results of each program are compared twice with the results of the eager pass. Sizes are
@@ -473,41 +464,17 @@ class Compilation:
         Args:
             size: The number of rows.
             forward: Runs a forward pass with that many rows, with different values in each call.
-            defers: Whether graphs of cores with parts are postponed until `add_deferred` is called,
-                since their captures are long, and other policies wait meanwhile. Until then, such a
-                core calls the programs of its parts.
 
         Raises:
             ConfigError: A program failed, and the mode is "require".
         """
-        self._add(size, forward, "parts" if defers else "all")
-
-    def add_deferred(self, forward: Callable[[int], object]) -> bool:
-        """Make the graphs that `add_size` has deferred for one batch size.
-
-        Args:
-            forward: Runs a forward pass with a number of rows, with different values in each call.
-
-        Returns:
-            Whether more sizes are left.
-
-        Raises:
-            ConfigError: A program failed, and the mode is "require".
-        """
-        if self.deferred:
-            size = self.deferred.pop(0)
-            self._add(size, partial(forward, size), "wholes")
-        return bool(self.deferred)
-
-    def _add(self, size: int, forward: Callable[[], object], scope: Scope) -> None:
-        """Make the programs for a batch size, for the cores in a scope."""
         began = time.monotonic()
-        self.building, self.scope = size, scope
+        self.building = size
         try:
             forward()  # The first pass makes the programs.
             forward()  # The second pass compares them after all of them were made.
         finally:
-            self.building, self.scope = None, "all"
+            self.building = None
 
         failures: list[str] = []
         for core in self.cores:
@@ -550,7 +517,6 @@ class Compilation:
         if not self.memories:
             return
         self.sizes.clear()
-        self.deferred.clear()
         self.memories.clear()
         self.graph_bytes = 0
         for core in self.cores:
@@ -595,7 +561,7 @@ class Core:
 
         # The programs of a batch size are being made.
         if owner.building is not None:
-            if rows == (self._rows or owner.building) and self._is_made_now():
+            if rows == (self._rows or owner.building):
                 return self._compared(list(map(_of_one_kind, tensors)))
             return self._function(*tensors)
 
@@ -638,25 +604,8 @@ class Core:
         """Return the size whose program computes a number of rows; None if the core runs
         eagerly.
         """
-        owner = self._owner
-        sizes = owner.sizes if self._rows is None else [self._rows]
-        if self._parts and owner.deferred:
-            # The graph of a larger size would take longer than the parts of this size.
-            fitting_size = next((size for size in sizes if size >= rows), None)
-            if fitting_size in owner.deferred:
-                return None
+        sizes = self._owner.sizes if self._rows is None else [self._rows]
         return next((size for size in sizes if size >= rows and size in self._programs), None)
-
-    def _is_made_now(self) -> bool:
-        """Return whether the core's program is made now; if it is deferred, record the batch
-        size.
-        """
-        owner = self._owner
-        if owner.scope == "parts" and self._parts:
-            if owner.building is not None and owner.building not in owner.deferred:
-                owner.deferred.append(owner.building)
-            return False
-        return owner.scope != "wholes" or bool(self._parts)
 
     def tier(self, size: int) -> str | None:
         """Return the tier of the program for a batch size; None if there is no program."""

@@ -25,8 +25,6 @@ class LoadingReport:
 
     on_progress: Callable[[str], None]  # called with each step, on the loading thread
     batch_sizes: Sequence[int]  # the batch sizes of the server, ascending
-    # Whether other policies of the process compute actions meanwhile, see `DefersLoading`.
-    beside_acts: bool = False
     # Parts that run without compilation, although `compile` is set.
     uncompiled: list[str] = field(default_factory=list)
     # Descriptions of the models' devices, see `accelerator.torch_device`.
@@ -61,8 +59,6 @@ def loading_report(
     batch_sizes: Sequence[int] = COMPILED_SIZES,
     on_out_of_memory: Callable[[], None] = lambda: None,
     on_gpu_ms: Callable[[float], None] = lambda _: None,
-    *,
-    beside_acts: bool = False,
 ) -> Iterator[LoadingReport]:
     """Yield the report of the policy that is loaded in this context.
 
@@ -71,7 +67,6 @@ def loading_report(
     report = LoadingReport(
         on_progress,
         batch_sizes,
-        beside_acts,
         on_out_of_memory=on_out_of_memory,
         on_gpu_ms=on_gpu_ms,
     )

@@ -402,24 +402,6 @@ def test_one_delayed_pass_while_a_model_loads_does_not_divide_later_batches(
     assert policy.model["passes"] == [size]
 
 
-def test_passes_are_measured_again_after_the_last_deferred_graph(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The earlier durations are those of cores without their graphs."""
-    monkeypatch.setattr(time, "perf_counter", lambda: Timed.now_s)
-    policy = Timed.from_config({"checkpoint": "none", "max_rows": 8, "batch_sizes": [1, 2, 8]})
-    policy.initialize()
-    left = iter([True, False])  # whether more graphs are left
-    monkeypatch.setattr(policy.compilation, "add_deferred", lambda _: next(left))
-
-    earlier = {1: 50.0, 2: 50.0, 8: 50.0}
-    policy.report.pass_s = dict(earlier)
-    assert policy.load_deferred()
-    assert policy.report.pass_s == earlier
-    assert not policy.load_deferred()
-    assert policy.report.pass_s == {1: 1.0, 2: 1.0, 8: 1.0}
-
-
 def test_values_are_read_after_a_copy_that_does_not_wait_is_over(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -8,7 +8,6 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -37,8 +36,6 @@ from vlagents_ray.policies.flow import FlowPasses
 from vlagents_ray.policies.loading import loading_report, report_device
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.models import model_manager
-from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray.weights.shared_values import _GpuMemory
@@ -395,48 +392,6 @@ def test_a_flow_is_one_graph_and_one_of_each_step_if_steps_are_changed(
     assert cuda.replays == []
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_beside_acts_a_flow_is_captured_step_by_step_and_as_a_whole_later(
-    cuda: FakeCuda, mode: CompileMode
-) -> None:
-    compilation = Compilation(mode)
-    passes, plain = Passes(cuda, compilation), Passes(cuda, Compilation(False))
-
-    def forward(size: int) -> Any:
-        return passes.sample(**drawn(cuda, size))
-
-    for size in (4, 1):
-        compilation.add_size(size, partial(forward, size), defers=True)
-    [encode, velocity, flow] = compilation.cores
-    assert [(encode.tier(size), velocity.tier(size)) for size in (1, 4)] == [
-        ("CUDA graph",) * 2
-    ] * 2
-    assert (flow.tier(1), flow.tier(4)) == (None, None)
-
-    def replays_of(rows: int) -> int:
-        inputs = drawn(cuda, rows)
-        expected = plain.sample(**inputs)
-        cuda.replays.clear()
-        same(passes.sample(**inputs), expected)
-        return len(cuda.replays)
-
-    step_by_step, whole = 1 + STEPS, 2
-    assert [replays_of(rows) for rows in (1, 2, 4)] == [step_by_step] * 3
-    captured = len(cuda.captures)
-    assert compilation.add_deferred(forward), (
-        "sizes must be captured one at a time, from the largest"
-    )
-    assert [replays_of(rows) for rows in (1, 2, 4)] == [step_by_step, whole, whole]
-    assert not compilation.add_deferred(forward)
-    assert [replays_of(rows) for rows in (1, 2, 4)] == [whole] * 3
-    assert len(cuda.captures) == captured + 2, "encode and the steps must not be captured again"
-    assert compilation.sizes == [1, 4]
-
-    compilation.add_size(2, partial(forward, 2), defers=True)
-    compilation.drop_graphs()
-    assert not compilation.add_deferred(forward), "a policy that wakes must capture all graphs"
-
-
 def test_the_graph_of_a_flow_has_the_compiled_steps(
     cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -548,68 +503,6 @@ def test_an_act_that_waits_for_the_device_waits_for_the_end_of_a_capture(
         engine.close()
 
 
-def test_another_checkpoint_is_loaded_on_another_stream_than_that_of_the_acts(
-    cuda: FakeCuda,
-) -> None:
-    streams: list[Any] = []
-
-    class Loading(Waiting):
-        def initialize(self) -> None:
-            streams.append(torch.cuda.current_stream())
-
-    engine = Engine(Checkpoints(lambda _: Loading(), {}, {"other": {"seed": 1}}, loaded=2))
-    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    engine.start()
-    try:
-        submit(engine, "a", Request("reset", Obs(), kwargs={"checkpoint": "other"}), replies.put)
-        assert replies.get(timeout=10).error is None
-    finally:
-        engine.close()
-    first, second = streams
-    assert first is torch.cuda.current_stream()
-    assert second is not first
-
-
-def test_what_a_load_beside_acts_defers_is_loaded_when_no_request_comes(
-    cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    parts: queue.SimpleQueue[Any] = queue.SimpleQueue()
-
-    class Deferring(Waiting):
-        parts_left = 2
-
-        def load_deferred(self) -> bool:
-            self.parts_left -= 1
-            # A push holds this lock when it waits for the model, so the lock must be acquired
-            # first.
-            assert CAPTURES.pushes._is_owned()  # type: ignore[attr-defined]
-            parts.put(torch.cuda.current_stream())
-            return self.parts_left > 0
-
-    monkeypatch.setattr(model_manager, "_CHECK_S", 0.02)
-    engine = Engine(Checkpoints(lambda _: Deferring(), {}, {"other": {"seed": 1}}, loaded=2))
-    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    engine.start()
-    try:
-        submit(engine, "a", Request("reset", Obs(), kwargs={"checkpoint": "other"}), replies.put)
-        assert replies.get(timeout=10).error is None
-        with engine.weights.acting_lock:  # as during a batch, or while the policy sleeps
-            monkeypatch.setattr(model_manager, "QUIET_S", 0.05)
-            with pytest.raises(queue.Empty):
-                parts.get(timeout=0.2)
-        streams = [parts.get(timeout=10) for _ in range(2)]
-        assert torch.cuda.current_stream() not in streams
-        with pytest.raises(queue.Empty):
-            parts.get(timeout=0.2)
-        models = list(engine.models._cache.loaded.values())
-        assert [model.deferred for model in models] == [None, None]
-        assert sorted(model.agent.parts_left for model in models) == [0, 2], (  # type: ignore[attr-defined]
-            "the first model must have nothing deferred"
-        )
-    finally:
-        engine.close()
-
-
 class OnStreams(Waiting):
     """A policy that records the stream of each of its calls."""
 
@@ -649,8 +542,7 @@ def test_all_calls_of_a_policy_are_on_one_stream_which_has_priority_over_pushes(
         for op in ("reset", "act"):
             submit(engine, "a", Request(op, Obs()), replies.put)  # type: ignore[arg-type]
             assert replies.get(timeout=10).error is None
-        [model] = engine.models._cache.loaded.values()
-        acts = model.acts
+        acts = engine.model.require_loaded().acts
         assert acts is not None
         preparation = preparations.begin(agent, Obs(), acts)
         assert preparation is not None
@@ -816,7 +708,7 @@ def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fail
         return sorted(reply.act.action.tolist() for reply in replies if reply.act is not None)
 
     try:
-        assert engine.models.devices == [{"kind": "cuda", "matmul": "high", "graphs_mib": 0.0}]
+        assert engine.model.devices == [{"kind": "cuda", "matmul": "high", "graphs_mib": 0.0}]
         alone = actions(act(4))
         assert len(alone) == 4
         cuda.most_rows = 2

@@ -256,15 +256,10 @@ class ModelPolicy(TrainableAgent, abc.ABC):
                 )
         elif self.report.accelerated:
             self.merge_products()
-        self._warm_up(defers=self.report.beside_acts)
+        self._warm_up()
 
-    def _warm_up(self, *, defers: bool = False) -> None:
-        """Run or compile each batch size.
-
-        Args:
-            defers: Whether long captures of CUDA graphs are postponed until `load_deferred` is
-                called.
-        """
+    def _warm_up(self) -> None:
+        """Run or compile each batch size."""
         sizes = self.config.batch_sizes or []
         self.report.pads = bool(sizes)
         if not sizes and self.report.accelerated:
@@ -276,10 +271,10 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             report_progress(f"{activity} {size} rows ({number} of {len(sizes)})")
             if cores:
                 run_examples = partial(self._run_examples, size, seeds)
-                self.compilation.add_size(size, run_examples, defers=defers)
+                self.compilation.add_size(size, run_examples)
             else:
                 self._run_examples(size, seeds)
-        if self.config.batch_sizes and not self.compilation.deferred:
+        if self.config.batch_sizes:
             self._measure_passes(seeds)
 
         if sizes:
@@ -289,20 +284,11 @@ class ModelPolicy(TrainableAgent, abc.ABC):
                 device["graphs_mib"] = round(self.compilation.graph_bytes / 2**20, 1)
         self.report.timer = gpu_timer(self.report)
 
-    def load_deferred(self) -> bool:
-        """Compile the deferred cores for one batch size; return whether more sizes are left."""
-        seeds = itertools.count()
-        is_left = self.compilation.add_deferred(partial(self._run_examples, seeds=seeds))
-        if not is_left:
-            self._measure_passes(seeds)
-        return is_left
-
     def _measure_passes(self, seeds: Iterator[int]) -> None:
         """Measure a forward pass of each batch size on an accelerator, so that later batches are
         split into the fastest passes.
 
-        The durations of earlier passes do not count: they include the loading of kernels, or are
-        those of cores whose compilation was deferred.
+        The durations of earlier passes do not count, as they include the loading of kernels.
         """
         is_compiled = self.compilation.mode and self.compilation.cores
         if not (self.report.accelerated or is_compiled):
