@@ -24,9 +24,14 @@ ENVS = ["tabletop/lift", "tabletop/slide"]
 class Trainee(Scripted):
     """A simulated policy with checkpoints."""
 
-    def reset(self, obs, instruction, checkpoint_step=0, seed=0, **kwargs):
+    def __init__(self, checkpoint_step):
+        """Create the policy at a training step."""
+        super().__init__()
+        self.checkpoint_step = checkpoint_step
+
+    def reset(self, obs, instruction, seed=0, **kwargs):
         """Begin an episode; the drift depends on the checkpoint and the seed of the episode."""
-        drift = 0.35 * 0.5 ** (checkpoint_step / 5000)  # drift per action
+        drift = 0.35 * 0.5 ** (self.checkpoint_step / 5000)  # drift per action
         self.drift = np.random.default_rng(seed).normal(0, drift, 3).astype(np.float32)
         return super().reset(obs, instruction, **kwargs)
 

@@ -72,5 +72,5 @@ def _pass_ms(measured: MeasuredPolicy) -> float | None:
 
 def _memory(measured: MeasuredPolicy) -> dict[str, float]:
     """Return the memory that the replica reports."""
-    memory = measured.engine.models.gpu_memory()
+    memory = measured.engine.model.gpu_memory()
     return {f"{kind}_mib": size / 2**20 for kind, size in memory.items() if kind != "free"}

@@ -248,7 +248,7 @@ def speed(lab: Lab, mode: bool | str) -> None:
             for kind in ("allocated", "reserved")
         }
         lab.show(load_s=measured.load_s, **{f"{kind}_mib": value for kind, value in held.items()})
-        lab.check("parts that are not compiled", measured.engine.models.uncompiled, equal=[])
+        lab.check("parts that are not compiled", measured.engine.model.uncompiled, equal=[])
         rows = curve(lab, measured, sizes)
         acts = {f"rows_{size}": np.stack(measured.actions(size, size)) for size in sizes}
         looked_at = [size for size in sizes if size <= _MOST_PLACES]
@@ -316,7 +316,7 @@ def pushes(lab: Lab) -> None:
 
     torch = require("torch")
     with lab.engine() as engine:
-        agent: Any = engine.models.own_weights._trainable
+        agent: Any = engine.model.own_weights._trainable
         live = agent.parameters()
         first = {name: own_copy(value) for name, value in live.items()}
         model_mib = sum(value.nbytes for value in first.values()) / 2**20
@@ -467,7 +467,7 @@ def sleep(lab: Lab) -> None:
     with lab.engine() as engine:
         robot = Session(engine, 0, weights="follow")
         first_kwargs = {"seed": 0, "weights": "follow"}
-        agent: Any = engine.models.own_weights._trainable
+        agent: Any = engine.model.own_weights._trainable
         shapes = _shapes_of(agent.parameters())
 
         def act() -> np.ndarray:
@@ -667,7 +667,7 @@ def destruction(lab: Lab) -> None:
     """
     torch, largest = require("torch"), lab.size(16, 2)
     with lab.engine(compile=False, batch_sizes=None, max_rows=largest) as engine:
-        agent: Any = engine.models.own_weights._trainable
+        agent: Any = engine.model.own_weights._trainable
         robots = [Session(engine, seed) for seed in range(largest)]
         run, hogs = agent.predict, []
 
