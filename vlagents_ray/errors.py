@@ -4,11 +4,11 @@
     ├── InvalidInput (also ValueError)      the request is wrong; sending it again will not help
     │   ├── MalformedMessage, MessageTooLarge
     │   ├── InvalidObservation              MissingCamera, MissingState, NotOffered
-    │   ├── UnknownSession, UnknownApp, UnknownCheckpoint, NotReset, ContractMismatch
+    │   ├── UnknownSession, UnknownApp, NotReset, ContractMismatch
     │   ├── InvalidWeights, UnchangedWeights, NotTrainable, WeightsNotStaged
     │   └── Unauthorized, Forbidden
     ├── Overloaded, TooManyRequests         not executed; send it again later
-    ├── PolicyFailed                        InvalidAction, CheckpointFailed
+    ├── PolicyFailed                        InvalidAction
     ├── PolicyUnavailable                   NoReplica, ConnectionLost
     ├── DeadlineExceeded (also TimeoutError)
     │   └── OutcomeUnknown
@@ -173,12 +173,6 @@ class UnknownApp(InvalidInput):
     status = 404
 
 
-class UnknownCheckpoint(InvalidInput):
-    """A reset named a checkpoint that the deployment does not offer; the message lists the
-    offered ones.
-    """
-
-
 class NotReset(InvalidInput):
     """`act` was called before `reset` in this session."""
 
@@ -263,12 +257,6 @@ class InvalidAction(PolicyFailed):
     ) -> None:
         super().__init__(*args)
         self.cause = cause  # see `vlagents_ray.chunking.fallback.Cause`
-
-
-class CheckpointFailed(PolicyFailed):
-    """The checkpoint named in a reset did not load. Other checkpoints still work, and the next
-    reset that names this one tries to load it again.
-    """
 
 
 class PolicyUnavailable(VLAgentsError):

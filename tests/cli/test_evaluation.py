@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import pytest
-from eval_fakes import LINE, OTHER_LINE
+from eval_fakes import LINE, OTHER_LINE, ToZero
 from in_process_evaluation import flat_config, play
 from typer.testing import CliRunner
 
@@ -24,6 +24,7 @@ from vlagents_ray.cli import evaluation as run
 from vlagents_ray.cli import policies
 from vlagents_ray.cli.evaluation import forecasts, live_address, print_plan
 from vlagents_ray.cli.main import app
+from vlagents_ray.cli.policies import Served
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.evaluate import (
@@ -113,7 +114,7 @@ def test_out_of_time_has_an_exit_status_of_its_own(
     monkeypatch.setattr(run, "evaluate_plan", evaluate)
     monkeypatch.setattr(run, "print_summary", lambda *_: None)
     monkeypatch.setattr(
-        run, "served", lambda config, *_, **__: contextlib.nullcontext((resolve(config), {}))
+        run, "served", lambda config, *_, **__: contextlib.nullcontext(Served(resolve(config)))
     )
     words = [*WORDS, "--out", str(tmp_path / "out"), "--end-at", "2027-01-31T18:30+00:00"]
     done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
@@ -176,7 +177,7 @@ def end_of(config: EvalConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[int, st
     monkeypatch.setattr(run, "evaluate_plan", lambda *_args, **_options: summary)
     monkeypatch.setattr(command, "config_from_options", lambda *_: config)
     monkeypatch.setattr(
-        run, "served", lambda config, *_, **__: contextlib.nullcontext((resolve(config), {}))
+        run, "served", lambda config, *_, **__: contextlib.nullcontext(Served(resolve(config)))
     )
     done = CliRunner().invoke(app, [*WORDS, "--out", str(config.out)], env={"COLUMNS": "200"})
     assert "Traceback" not in done.output
@@ -333,15 +334,22 @@ def test_nothing_is_left_of_a_case_that_stopped(config: Callable[..., EvalConfig
     assert (found.finished, found.remaining) == (20, 0)
 
 
+class Swept(ToZero):
+    """A policy with checkpoints."""
+
+    def __init__(self, checkpoint_step: int = 0) -> None:
+        super().__init__()
+
+
 def test_the_plan_is_printed_without_asking_any_policy(
     config: Callable[..., EvalConfig],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("COLUMNS", "150")
-    settings = config(
-        episodes=5, policy_url="http://127.0.0.1:9", steps=[10, 20], envs=[LINE, OTHER_LINE]
-    )
+    settings = config(episodes=5, envs=[LINE, OTHER_LINE])
+    policies = [PolicyConfig(name="policy", source=f"{__name__}:Swept", steps=[10, 20])]
+    settings = settings.model_copy(update={"policies": policies})
     print_plan(settings)
     text = capsys.readouterr().out
     assert "4 cases" in text

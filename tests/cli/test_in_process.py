@@ -76,8 +76,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
     folder: Path,
 ) -> None:
-    choices = {"late": {"checkpoint": "w-2.txt"}}
-    own = deployment(config={"checkpoint": "w-1.txt"}, checkpoints={"choices": choices})
+    own = deployment(config={"checkpoint": "w-2.txt"})
     (folder / "own.yaml").write_text(yaml.safe_dump(own))
     swept = {
         "name": "swept",
@@ -85,10 +84,10 @@ def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
         "config": {"checkpoint": "w-{step}.txt"},
         "steps": [1, 2],
     }
-    chosen = {"name": "chosen", "source": "own.yaml", "options": {"checkpoint": "late"}}
+    late = {"name": "late", "source": "own.yaml"}
     still = {"name": "still", "source": "noop", "config": {"action_dim": 1}}
     plan = {
-        "policies": [swept, chosen, still],
+        "policies": [swept, late, still],
         "suites": [{"envs": [LINE], "episodes": 4}],
         "video": "none",
     }
@@ -107,7 +106,7 @@ def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
     actions = {
         name: [one.result.actions_sha256 for one in case.episodes] for name, case in cases.items()
     }
-    assert actions["swept@2"] == actions["chosen"]
+    assert actions["swept@2"] == actions["late"]
     assert len({tuple(one) for one in actions.values()}) == 3
     assert {one.result.checkpoint for one in cases["swept@1"].episodes} == {"w-1.txt"}
     assert {one.result.transport for case in cases.values() for one in case.episodes} == {"local"}

@@ -18,6 +18,7 @@ from typer.testing import CliRunner, Result
 from vlagents_ray.cli import evaluate as command
 from vlagents_ray.cli import evaluation as run
 from vlagents_ray.cli.main import app
+from vlagents_ray.cli.policies import Served
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs import EvalEnv
 from vlagents_ray.envs.base import SequentialBatch
@@ -60,7 +61,9 @@ def eval_of(
     )
     monkeypatch.setattr(command, "config_from_options", lambda *_: config)
     monkeypatch.setattr(
-        run, "served", lambda *_, **__: contextlib.nullcontext((resolve(config), {"policy": agent}))
+        run,
+        "served",
+        lambda *_, **__: contextlib.nullcontext(Served(resolve(config), {"policy": agent})),
     )
     return CliRunner().invoke(
         app, ["eval", LINE, "--policy", "http://127.0.0.1:9"], env={"COLUMNS": "300"}

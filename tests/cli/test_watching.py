@@ -13,34 +13,36 @@ from eval_fakes import LINE
 
 from vlagents_ray.cli import evaluation as run
 from vlagents_ray.cli.evaluation import _trained_policy, watch_training
-from vlagents_ray.cli.policies import resolve_policies
+from vlagents_ray.cli.policies import Served, resolve_policies
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Progress, Results, Summary
 from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
 from vlagents_ray.evaluate.plan.jobs import plan_jobs
-from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
 from vlagents_ray.policies.base import ModelConfig
 from vlagents_ray.registry import names, policy_class
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, own_settings, read_deployment
 
-SWEPT = {"name": "swept", "url": "http://127.0.0.1:9", "checkpoint": "/runs/{step}"}
-FIXED = {"name": "fixed", "url": "http://127.0.0.1:9", "checkpoint": "/runs/9"}
+SOURCE = "served_agents:Stored"
+SWEPT = {"name": "swept", "source": SOURCE, "config": {"checkpoint": "/runs/{step}"}}
+FIXED = {"name": "fixed", "source": SOURCE, "config": {"checkpoint": "/runs/9"}}
+AT_URL = {"name": "remote", "url": "http://127.0.0.1:9", "checkpoint": "/runs/{step}"}
 
 
 @pytest.mark.parametrize(
     ("policies", "file", "text"),
     [
         (
-            [FIXED],
+            [FIXED, AT_URL],
             None,
-            r"expected \{step\} in the checkpoint of one policy, .*, got 0 such policies",
+            r"in the checkpoint of one policy that this command serves, .*, got 0 such policies",
         ),
         (
             [SWEPT, SWEPT | {"name": "other"}],
             None,
-            r"expected \{step\} in the checkpoint of one policy, .*, got 2 such policies",
+            r"in the checkpoint of one policy that this command serves, .*, got 2 such policies",
         ),
         ([SWEPT | {"steps": [10]}], None, "expected no `steps` with --watch"),
         ([SWEPT], "runs/training_finished", "ended without a checkpoint"),
@@ -68,7 +70,8 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
     )
     played: list[list[int]] = []
 
-    def play(resolved: ResolvedPlan, _progress: Progress, **_: Any) -> Summary:
+    def play(running: Served, _progress: Progress) -> Summary:
+        resolved = running.plan
         played.append(resolved.policies[0].steps)
         with Store(resolved) as store:
             store.begin_run({})
@@ -83,7 +86,7 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
     monkeypatch.setattr(run, "evaluate_and_print", play)
     monkeypatch.setattr(run, "rounds", lambda *_: iter([[10], [20, 30]]))
     monkeypatch.setattr(
-        run, "served", lambda config, *_: contextlib.nullcontext((resolve(config), {}))
+        run, "served", lambda config, *_: contextlib.nullcontext(Served(resolve(config)))
     )
     with pytest.raises(typer.Exit) as ended:
         watch_training(config.model_copy(update={"workers": 0}), tmp_path)

@@ -605,7 +605,7 @@ def test_a_replica_that_is_only_slow_keeps_the_session_or_gives_it_on(
         agent.reset(obs(1), "stack")
         served.prefer = prefer
         agent._connection.timeout_s = 30.0
-        model = next(iter(served.engines[0].models._cache.loaded.values()))
+        model = served.engines[0].model.loaded
         slow = True
         with model.busy, pytest.raises(DeadlineExceeded):
             agent.act(obs(2))  # this act is executed later

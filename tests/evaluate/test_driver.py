@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
-from vlagents_ray.errors import ConfigError, EnvFailed, PolicyFailed
+from vlagents_ray.errors import ConfigError, EnvFailed, PolicyFailed, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts
 from vlagents_ray.evaluate.driver import Consumer, Driver
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.config import PolicyConfig
 from vlagents_ray.evaluate.plan.jobs import Job, plan_jobs
-from vlagents_ray.evaluate.plan.resolved import resolve
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
+from vlagents_ray.evaluate.workers.base import WorkerHandle, Workers
 from vlagents_ray.evaluate.workers.rollout import Report
 
 Config = Callable[..., EvalConfig]
@@ -155,3 +159,149 @@ def test_errors_of_the_policy_in_a_row_end_it_with_their_cure(config: Config) ->
     with pytest.raises(PolicyFailed, match=r"2 episodes in a row .*got NaN; mend the policy"):
         driver.take(job, failed)
     assert consumer.statuses == ["policy_error"] * 2
+
+
+# A sweep over checkpoints: a server has one of them at a time.
+
+
+class Server:
+    """A server whose swaps of checkpoints the test ends."""
+
+    def __init__(self) -> None:
+        self.begun: list[tuple[str, int]] = []
+        self.loaded: set[str] = set()  # policies whose last swap has ended
+        self.error: VLAgentsError | None = None
+
+    def begin(self, policy: str, step: int) -> None:
+        self.begun.append((policy, step))
+        self.loaded.discard(policy)
+
+    def is_done(self, policy: str) -> bool:
+        if self.error is not None:
+            raise self.error
+        return policy in self.loaded
+
+
+class Pool(Workers):
+    """A worker of a policy's episodes, which the test ends."""
+
+    def __init__(self, plan: ResolvedPlan) -> None:
+        super().__init__(plan, lambda _: pytest.fail("made"))
+        self.played: list[str] = []
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def free_slot(self) -> bool:
+        return not self._workers
+
+    def start(self, case: EvalCase) -> None:
+        self._workers.append(
+            WorkerHandle(case.worker, case.kind, actor=None, starting=None, started_at=0.0)
+        )
+
+    def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
+        worker.jobs = jobs
+        self.played += [f"{job.case.policy_id}#{job.key.episode}" for job in jobs]
+
+    def end(self) -> Job:
+        """End the running episode, and return its job."""
+        [worker] = self._workers
+        [job] = worker.jobs
+        worker.jobs = ()
+        return job
+
+    def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
+        yield from ()
+
+    def close(self) -> None:
+        pass
+
+
+def sweep(config: Config, **policy: Any) -> ResolvedPlan:
+    """Return a plan with the steps 10 and 20 of the policy "a", and the policy "b" of one
+    checkpoint.
+    """
+    base = config(episodes=2)
+    swept = {"name": "a", "url": "serve://a", "steps": [10, 20]} | policy
+    policies = [PolicyConfig(**swept), PolicyConfig(name="b", url="serve://b")]
+    return resolve(base.model_copy(update={"policies": policies}))
+
+
+def run_all(driver: Driver, pool: Pool, server: Server | None = None) -> None:
+    """Run all jobs, with one hand-out for each event."""
+    for _ in range(50):
+        driver.hand_out(pool)
+        driver.hand_out(pool)  # the first one starts the worker
+        if pool.busy:
+            job = pool.end()
+            driver.take(job, Report(result=EpisodeResult(job.key, "done")))
+        elif server is not None and server.begun:
+            server.loaded.add(server.begun[-1][0])
+
+
+def test_all_episodes_of_a_checkpoint_end_before_the_next_one_is_loaded(config: Config) -> None:
+    plan, server = sweep(config), Server()
+    driver, pool = Driver(plan, plan_jobs(plan.cases), Collected(), server), Pool(plan)
+    assert driver.waiting == 6
+    run_all(driver, pool, server)
+    assert server.begun == [("a", 10), ("a", 20)]
+    of_a = [name for name in pool.played if name.startswith("a")]
+    assert of_a == ["a@10#0", "a@10#1", "a@20#0", "a@20#1"]
+    assert sorted(pool.played) == sorted([*of_a, "b#0", "b#1"])
+    assert driver.waiting == 0
+
+
+def test_other_policies_play_while_a_checkpoint_is_loaded(config: Config) -> None:
+    plan, server = sweep(config), Server()
+    driver, pool = Driver(plan, plan_jobs(plan.cases), Collected(), server), Pool(plan)
+    run_all(driver, pool)
+    assert pool.played == ["b#0", "b#1"]
+    assert server.begun == [("a", 10)]
+    assert driver.waiting == 4
+
+
+def test_a_failed_attempt_is_repeated_before_the_next_checkpoint_is_loaded(config: Config) -> None:
+    plan, server = sweep(config), Server()
+    jobs = [job for job in plan_jobs(plan.cases) if job.case.policy.name == "a"]
+    driver, pool = Driver(plan, jobs, Collected(), server), Pool(plan)
+    server.loaded.add("a")
+    driver.hand_out(pool)
+    server.loaded.add("a")
+    driver.hand_out(pool)
+    driver.hand_out(pool)
+    driver.take(pool.end(), Report(failure=BROKEN))
+    run_all(driver, pool, server)
+    assert pool.played == ["a@10#0", "a@10#0", "a@10#1", "a@20#0", "a@20#1"]
+
+
+def test_a_running_episode_delays_the_next_checkpoint(config: Config) -> None:
+    plan, server = sweep(config), Server()
+    jobs = [job for job in plan_jobs(plan.cases) if job.case.policy.name == "a"]
+    driver, pool = Driver(plan, [jobs[0], jobs[2]], Collected(), server), Pool(plan)
+    for _ in range(3):
+        driver.hand_out(pool)
+        server.loaded.add("a")
+    driver.hand_out(pool)
+    assert pool.busy
+    assert server.begun == [("a", 10)]
+    pool.end()
+    driver.hand_out(pool)
+    assert server.begun == [("a", 10), ("a", 20)]
+
+
+def test_a_checkpoint_that_does_not_load_ends_the_run_with_its_cause(config: Config) -> None:
+    plan, server = sweep(config), Server()
+    driver, pool = Driver(plan, plan_jobs(plan.cases), Collected(), server), Pool(plan)
+    driver.hand_out(pool)
+    server.error = ConfigError("policy 'a': checkpoint_step 10: no such file")
+    with pytest.raises(ConfigError, match="no such file"):
+        driver.hand_out(pool)
+
+
+def test_agents_of_the_workers_need_no_server_for_a_sweep(config: Config) -> None:
+    plan = sweep(config)
+    driver, pool = Driver(plan, plan_jobs(plan.cases), Collected()), Pool(plan)
+    run_all(driver, pool)
+    of_a = [name for name in pool.played if name.startswith("a")]
+    assert of_a == ["a@10#0", "a@10#1", "a@20#0", "a@20#1"]

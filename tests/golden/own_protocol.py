@@ -100,13 +100,11 @@ def episodes() -> Iterator[Trace]:
     )
     yield from scenario("what an act answers", EVERYWHERE, begin, answers)
     yield from scenario(
-        "an episode has an instruction, options and a checkpoint",
+        "an episode has an instruction and options",
         FRAMES,
         asks(reset("pick", kwargs={"seed": 3, "list": [1.5]}), act()),
-        asks(reset("place it", kwargs={"checkpoint": "other"}), act()),
-        asks(
-            reset(kwargs={"checkpoint": "none"}), reset(kwargs={"checkpoint_step": 7}), reset(None)
-        ),
+        asks(reset("place it"), act()),
+        asks(reset(None)),
         asks(reset(contract={"cameras": {"side": {}}, "action": {"dim": 3}}), act()),
     )
     yield from scenario(

@@ -57,7 +57,7 @@ from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
-from vlagents_ray.serve.models.checkpoints import Checkpoints
+from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.serve.ports import free_port, reserve
 
 LIMITS = MessageLimits(
@@ -194,14 +194,12 @@ class Server:
         self._running.callback(lambda: self._own and self._own.close())  # closed after the engine
 
         session_limit = settings.get("sessions", 100)
-        self._offered = partial(
-            Checkpoints, self._agent, {"checkpoint": "first"}, {"other": {"checkpoint": "second"}}
-        )
+        policy = PolicySource(self._agent, {"checkpoint": "first"})
         self._replicas: Replicas | None = None
         gateway = self._dialects.keys() & _GATEWAYS.keys()
         if gateway or settings.get("replicas"):
             self._replicas = Replicas(
-                [self._offered() for _ in range(settings.get("replicas", 1))],
+                [policy for _ in range(settings.get("replicas", 1))],
                 wall_clock=_wall_clock,
                 session_limit=session_limit,
             )
@@ -209,7 +207,7 @@ class Server:
             self.engines = self._replicas.engines
         else:
             engine_settings = EngineSettings(session_limit=session_limit)
-            self.engines = [Engine(self._offered(), engine_settings, wall_clock=_wall_clock)]
+            self.engines = [Engine(policy, engine_settings, wall_clock=_wall_clock)]
             self._running.callback(self.engines[0].close)
         self._ports: dict[int, int] = {}  # HTTP ports by replica
         for name in gateway:

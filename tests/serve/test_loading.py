@@ -39,7 +39,7 @@ class Bare(PolicyReplica):
 
 def replica(start: Any) -> Bare:
     """Return a replica with only the attributes that its start uses."""
-    engine: Any = SimpleNamespace(start=start, models=SimpleNamespace(configure=lambda _: None))
+    engine: Any = SimpleNamespace(start=start)
     one = object.__new__(Bare)
     vars(one).update(
         _args=ServerArgs(policy="noop"),
@@ -59,7 +59,7 @@ def test_a_replica_runs_when_its_policy_has_loaded() -> None:
     loaded = threading.Event()
 
     async def start() -> list[bool]:
-        one = replica(lambda: loaded.wait(60))
+        one = replica(lambda _: loaded.wait(60))
         running = asyncio.ensure_future(one.reconfigure({}, None))
         await asyncio.wait({running}, timeout=0.3)
         before = running.done()
@@ -84,7 +84,7 @@ def test_a_replica_runs_when_its_parts_have_prepared_for_the_loaded_policy() -> 
             events.append("works")
 
     async def start() -> None:
-        one = replica(lambda: events.append("policy is loaded"))
+        one = replica(lambda _: events.append("policy is loaded"))
         vars(one).update(_parts=Parts())
         await one.reconfigure({}, None)
         events.append("is ready")
@@ -104,7 +104,7 @@ def test_only_the_traceback_of_a_policys_own_bug_is_shown(
     to find.
     """
 
-    def fail() -> None:
+    def fail(_: object) -> None:
         raise PolicyFailed("the policy did not load: no jax") from cause
 
     one = replica(fail)
@@ -147,8 +147,8 @@ def test_serve_leaves_a_replica_that_does_not_answer_as_much_time_as_a_call_may_
 ) -> None:
     """The policy may hold the GIL meanwhile. Only Serve's checks limit this time."""
     policy = application(ServerArgs(policy="noop", limits={"act_s": act_s}))._bound_deployment
-    assert policy._deployment_config.max_constructor_retry_count == 1, (
-        "Serve must give up after the first failed start"
+    assert policy._deployment_config.max_constructor_retry_count == 2, (
+        "Serve must start a second replica, as the first may have been killed while it loaded"
     )
     silent_s = 3 * policy._deployment_config.health_check_timeout_s
     assert act_s <= silent_s <= max(15.0, act_s)
@@ -293,3 +293,22 @@ def test_a_replica_answers_what_waits_before_its_ways_in_and_its_parts_close() -
         "parts",
         "metrics",
     ]
+
+
+def test_later_settings_replace_the_loaded_policy_before_the_replica_runs_again() -> None:
+    """Serve sends no client to a replica until `reconfigure` returns, and replaces the replica if
+    it raises an error.
+    """
+    configs: list[tuple[str, dict[str, Any]]] = []
+
+    async def start() -> None:
+        one = replica(lambda config: configs.append(("start", config)))
+        vars(one)["_engine"].swap = lambda config: configs.append(("swap", config))
+        await one.reconfigure(None, None)
+        await asyncio.gather(*one._tasks)
+        one._tasks = []
+        await one.reconfigure({"checkpoint_step": 2}, None)
+        assert one._tasks == [], "the periodic tasks run already"
+
+    asyncio.run(start())
+    assert configs == [("start", {}), ("swap", {"checkpoint_step": 2})]

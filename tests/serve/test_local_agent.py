@@ -14,7 +14,7 @@ from in_process_evaluation import flat_config
 from in_process_replicas import Replicas
 
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.errors import ContractMismatch, UnknownCheckpoint
+from vlagents_ray.errors import ContractMismatch
 from vlagents_ray.evaluate import Summary, evaluate
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -94,21 +94,6 @@ def test_its_episodes_are_those_of_a_replica(
     assert {one["status"] for one in here} == {"done", "policy_error"}
     described = found[0].results.policies["policy"]
     assert (described["policy"], described["config"]) == (THIS, {"length": 0.8})
-
-
-def test_a_session_chooses_its_checkpoint_which_is_loaded_meanwhile(tmp_path: Path) -> None:
-    args = ServerArgs(policy=THIS, checkpoints={"choices": {"short": {"length": 0.25}}})
-    agent = LocalPolicy(args, {"length": 1.0})
-    agent.initialize()
-    obs = Obs(state={"position": np.ones(1, np.float32)})
-    sizes = {}
-    for options in ({}, {"checkpoint": "short"}, {}):
-        agent.reset(obs, "go", seed=1, **options)
-        sizes[options.get("checkpoint")] = float(abs(agent.act(obs).action[0]))
-    assert sizes["short"] == pytest.approx(sizes[None] / 4)
-    with pytest.raises(UnknownCheckpoint, match="short"):
-        agent.reset(obs, "go", checkpoint="long")
-    agent.close()
 
 
 def test_the_contract_of_the_environment_is_compared_first() -> None:

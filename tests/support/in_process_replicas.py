@@ -35,7 +35,7 @@ from vlagents_ray.serve.access.charges import free
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.engine.settings import EngineSettings
-from vlagents_ray.serve.models.checkpoints import Checkpoints
+from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.serve.scaling.session_migration import Peer, PeerEnded, SessionMigrator
 from vlagents_ray.serve.sessions import SessionState
 
@@ -47,7 +47,7 @@ class Replicas:
 
     def __init__(
         self,
-        agents: Sequence[Agent | Checkpoints],
+        agents: Sequence[Agent | PolicySource],
         *,
         wall_clock: Callable[[], int] = time.time_ns,
         **options: Any,

@@ -17,7 +17,7 @@ from vlagents_ray.contract import Contract, StateSpec
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
-from vlagents_ray.serve.models.checkpoints import Checkpoints
+from vlagents_ray.serve.models.loaded_model import PolicySource
 
 
 class Numbered(Agent):
@@ -38,6 +38,7 @@ class Numbered(Agent):
 
     def initialize(self) -> None:
         self.library.load(self)
+        self.library.threads.append(threading.current_thread().name)
         self.number = float(self.name.rpartition("/")[2])
         # A reference cycle, as in real policies: only garbage collection frees the policy.
         self.itself = self
@@ -66,6 +67,7 @@ class Library:
     def __init__(self) -> None:
         self.loads: Counter[str] = Counter()
         self.closed: list[str] = []
+        self.threads: list[str] = []  # names of the threads that loaded policies
         self.alive: weakref.WeakValueDictionary[str, Agent] = weakref.WeakValueDictionary()
         self.batches: list[tuple[str, list[str]]] = []
         self.joints: dict[str, int] = {}  # number of joints in a checkpoint's contract
@@ -94,16 +96,10 @@ class Library:
         while self.begun.get(timeout=10) != name:
             pass
 
-    def engine(
-        self, *, choices: Sequence[str] = (), steps: bool = False, loaded: int = 2, **options: Any
-    ) -> Engine:
-        """Return a running engine whose default checkpoint is "a/1". Each of `choices`, such as
-        "b/2", is selected with its first letter.
-        """
-        config = {"checkpoint": "a/{step}", "checkpoint_step": 1}
-        named = {choice[0]: {"checkpoint": choice} for choice in choices}
-        checkpoints = Checkpoints(self.make, config, named, steps=steps, loaded=loaded)
-        engine = Engine(checkpoints, EngineSettings(**options))
+    def engine(self, **options: Any) -> Engine:
+        """Return a running engine with the checkpoint "a/1"."""
+        policy = PolicySource(self.make, {"checkpoint": "a/{step}", "checkpoint_step": 1})
+        engine = Engine(policy, EngineSettings(**options))
         engine.start()
         return engine
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.evaluate import EvalConfig, Summary
-from vlagents_ray.evaluate.plan.config import PolicyConfig
+from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.robot import Operator, TerminalOperator, evaluate_on_robot
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot.simulated import SimulatedRobot
@@ -117,9 +117,9 @@ class Policies:
         self.made: list[str] = []
         self.make = make
 
-    def __call__(self, policy: PolicyConfig) -> Agent:
-        self.made.append(policy.name)
-        return self.make(policy.name)
+    def __call__(self, case: EvalCase) -> Agent:
+        self.made.append(case.policy.name)
+        return self.make(case.policy.name)
 
 
 class Evaluation:

@@ -106,6 +106,6 @@ def shared_server(config: Any) -> Iterator[Any]:
         wait_until_ready(serve, urls, set(paths), deadline)
         if (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")) is not None:
             wait_for_haproxy(serve, paths, int(stats_port), deadline)
-        yield Server(url, urls)
+        yield Server(url, config, urls)
     finally:
         client.delete_apps(list(serve.status().applications))

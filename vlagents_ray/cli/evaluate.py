@@ -205,7 +205,7 @@ class EvalOptions:
         typer.Option(
             "--reset-set",
             metavar="KEY=VALUE",
-            help="An option of the policy's reset, such as checkpoint_step=9. May be repeated.",
+            help="An option of the policy's reset, such as weights=follow. May be repeated.",
         ),
     ] = field(default_factory=list)
     watch: Annotated[

@@ -9,9 +9,8 @@ import datetime
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import typer
@@ -22,7 +21,7 @@ from vlagents_ray.cli.console import fail, out
 from vlagents_ray.cli.exit_status import OUT_OF_TIME
 from vlagents_ray.cli.listing import require_packages
 from vlagents_ray.cli.policies import (
-    Agents,
+    Served,
     planned_workers,
     policy_deployment,
     resolve_policies,
@@ -48,12 +47,11 @@ from vlagents_ray.evaluate.report.terminal import LineProgress
 from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cases, summarize
 from vlagents_ray.evaluate.run import evaluate_plan
-from vlagents_ray.policies.base.checkpoint import STEP
+from vlagents_ray.policies.base.checkpoint import CHECKPOINT, STEP
 from vlagents_ray.ray_tools.private import node_of_this_process
 from vlagents_ray.registry import function_in_plugin, registered_class
 from vlagents_ray.serve.access.api_keys import load_keys, require_watch_keys
 from vlagents_ray.serve.launch.deployment_file import own_settings
-from vlagents_ray.serve.models.checkpoints import CHOICE
 from vlagents_ray.serve.ports import LOOPBACK, is_free
 
 POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a case
@@ -180,18 +178,16 @@ def run_evaluation(
 
     with contextlib.ExitStack() as stack:
         try:
-            plan, agents = stack.enter_context(
-                served(config, address, replica_per_gpu=replica_per_gpu)
-            )
+            running = stack.enter_context(served(config, address, replica_per_gpu=replica_per_gpu))
         except KeyboardInterrupt as error:
             raise KeyboardInterrupt(
                 "interrupted while Ray and the policies started; no episode began: repeat the "
                 "command"
             ) from error
-        progress = stack.enter_context(shown_progress(plan, live))
-        summary = evaluate_and_print(plan, progress, end_at, agents)
+        progress = stack.enter_context(shown_progress(running.plan, live))
+        summary = evaluate_and_print(running, progress, end_at)
 
-    require_results(plan.cases, summary)
+    require_results(running.plan.cases, summary)
 
 
 def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:
@@ -202,32 +198,38 @@ def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> 
         address: The Ray cluster, see `served`.
         only: The number and the seed of the episode, as in `evaluate`.
     """
-    with served(config, address) as (plan, agents), shown_progress(plan, None) as progress:
-        return evaluate_plan(plan, agent_factory=agents, progress=progress, only=only)
+    with served(config, address) as running, shown_progress(running.plan, None) as progress:
+        return evaluate_plan(
+            running.plan,
+            agent_factory=running.agents,
+            swaps=running.swaps,
+            progress=progress,
+            only=only,
+        )
 
 
-def evaluate_and_print(
-    plan: ResolvedPlan,
-    progress: Progress,
-    end_at: float | None = None,
-    agents: Agents | None = None,
-) -> Summary:
+def evaluate_and_print(running: Served, progress: Progress, end_at: float | None = None) -> Summary:
     """Evaluate policies, and print the table of the results, even if the evaluation is
     interrupted.
 
     Args:
-        plan: The plan of the evaluation, as `served` yields it.
+        running: The evaluation and its policies.
         progress: Shows the progress.
         end_at: The time after which no episode ends, as in `evaluate_plan`.
-        agents: The policies that run in this process, as `served` yields them.
 
     Returns:
         The summary of the results.
     """
     try:
-        summary = evaluate_plan(plan, agent_factory=agents, progress=progress, end_at=end_at)
+        summary = evaluate_plan(
+            running.plan,
+            agent_factory=running.agents,
+            swaps=running.swaps,
+            progress=progress,
+            end_at=end_at,
+        )
     except PolicyFailed as error:
-        results = Results.load(plan.out)
+        results = Results.load(running.plan.out)
         if not failing_cases(results):
             raise
         print_summary(out, summarize(results))
@@ -294,10 +296,10 @@ def watch_training(
 ) -> None:
     """Evaluate each checkpoint of a running training as soon as the checkpoint is complete.
 
-    All results are in one folder, and one server runs for all checkpoints. Policies without
-    `{step}` are evaluated in the first round. The evaluation ends after the step `until`, or by
-    Ctrl-C; it can be resumed. An episode without a result ends the command with status 1, after the
-    last round.
+    All results are in one folder, and one server loads the checkpoints one after another. Policies
+    without `{step}` are evaluated in the first round. The evaluation ends after the step `until`,
+    or by Ctrl-C; it can be resumed. An episode without a result ends the command with status 1,
+    after the last round.
 
     Args:
         config: The evaluation, in which the checkpoint of one policy contains `{step}`.
@@ -350,20 +352,21 @@ def watch_training(
     workers = 1 if config.workers is None else config.workers  # 1: a training run is long
     planned = _with_steps(config, trained, first).model_copy(update={"workers": workers})
     with contextlib.ExitStack() as stack:
-        plan, agents = stack.enter_context(served(planned, address))
+        running = stack.enter_context(served(planned, address))
+        plan = running.plan
         if plan.workers:
             from vlagents_ray.evaluate.workers.cluster import ray_cluster
 
             stack.enter_context(ray_cluster(plan))
 
         progress = stack.enter_context(shown_progress(plan, live, goes_on=True))
-        summary = evaluate_and_print(plan, progress, agents=agents)
+        summary = evaluate_and_print(running, progress)
         cases = [*plan.cases]
         for steps in rounds_of_steps:
             settings = _with_steps(plan.settings, trained, steps)
             later = resolve(settings.model_copy(update={"resume": True}))
             cases += later.cases
-            summary = evaluate_and_print(later, progress, agents=agents)
+            summary = evaluate_and_print(replace(running, plan=later), progress)
 
     require_results(cases, summary)
 
@@ -372,19 +375,17 @@ def _trained_policy(config: EvalConfig) -> tuple[int, str]:
     """Return the index of the trained policy, and the pattern of its checkpoints."""
     patterns = {}
     for index, policy in enumerate(config.policies):
-        settings: dict[str, Any] = {CHOICE: policy.checkpoint}
-        if policy.source is not None and "://" not in policy.source:
-            deployment = policy_deployment(policy, policy.source, step_follows=True)
-            settings |= own_settings(deployment.applications[0])
-
-        checkpoint = settings[CHOICE]
+        if policy.source is None or "://" in policy.source:  # a running server has one checkpoint
+            continue
+        deployment = policy_deployment(policy, policy.source, step_follows=True)
+        checkpoint = own_settings(deployment.applications[0]).get(CHECKPOINT)
         if isinstance(checkpoint, str) and STEP in checkpoint:
             patterns[index] = checkpoint
 
     if len(patterns) != 1:
         raise ConfigError(
-            f"--watch: expected {STEP} in the checkpoint of one policy, such as checkpoint: "
-            f"/runs/a/{STEP}, got {len(patterns)} such policies"
+            f"--watch: expected {STEP} in the checkpoint of one policy that this command serves, "
+            f"such as checkpoint: /runs/a/{STEP}, got {len(patterns)} such policies"
         )
     [(index, pattern)] = patterns.items()
     if config.policies[index].steps:
@@ -428,7 +429,8 @@ def run_on_robot(
         return
 
     require_trials(config)  # before any process starts
-    with served(config, address) as (plan, _), contextlib.ExitStack() as stack:
+    with served(config, address) as running, contextlib.ExitStack() as stack:
+        plan = running.plan
         if operator == "terminal":
             summary = play_trials(plan, TerminalOperator())
         else:

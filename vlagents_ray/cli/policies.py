@@ -7,6 +7,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any
 
@@ -18,6 +19,7 @@ from vlagents_ray.contract import require_match
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError, MalformedMessage, shown
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
+from vlagents_ray.evaluate.driver import CheckpointSwaps
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.resolved import (
     ResolvedPlan,
@@ -31,6 +33,7 @@ from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.interface import Agent
 from vlagents_ray.overrides import YAML_SUFFIXES
 from vlagents_ray.policies.base.accelerator import VISIBLE
+from vlagents_ray.policies.base.checkpoint import CHECKPOINT, CHECKPOINT_STEP, checkpoint_name
 from vlagents_ray.ray_tools.private import gpus_here
 from vlagents_ray.ray_tools.session import joined, variables
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -43,18 +46,29 @@ from vlagents_ray.serve.launch.deployment_file import (
     read_deployment,
     together,
     with_settings,
+    with_user_config,
 )
 from vlagents_ray.serve.local_agent import LocalPolicy
-from vlagents_ray.serve.models.checkpoints import STEP, resolved
 
-Agents = Mapping[str, Callable[[], Agent]]  # policies that run in this process, by name
+Agents = Mapping[str, Callable[..., Agent]]  # policies that run in this process, by name
 _STARTING_S = 30.0  # time limit for a server at a URL
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """An evaluation whose policies are served, or can be created in this process."""
+
+    plan: ResolvedPlan
+    # Without workers, the agents of the policies that are not at a URL.
+    agents: Agents = field(default_factory=dict)
+    # The servers of the policies that are not at a URL; None if there are none.
+    swaps: CheckpointSwaps | None = None
 
 
 @contextlib.contextmanager
 def served(
     config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False
-) -> Iterator[tuple[ResolvedPlan, Agents]]:
+) -> Iterator[Served]:
     """Resolve an evaluation and, within the context, serve its policies that are not at a URL, or
     run them in this process.
 
@@ -64,7 +78,7 @@ def served(
         replica_per_gpu: Whether each policy has a replica on each GPU of the cluster.
 
     Yields:
-        The plan; and, without workers, the agents of the policies that are not at a URL.
+        The plan with its policies.
     """
     _require_cluster_workers(config, address)
     with contextlib.ExitStack() as stack:
@@ -103,11 +117,12 @@ def served(
                     "worker of Ray)"
                 )
             stack.enter_context(variables(_variables(config, local)))
-        elif deployments:
-            stack.enter_context(
-                _serve_on_ray(plan, deployments, address, replica_per_gpu=replica_per_gpu)
+        swaps = None
+        if local is None and deployments:
+            swaps = stack.enter_context(
+                _served_on_ray(plan, deployments, address, replica_per_gpu=replica_per_gpu)
             )
-        yield plan, agents
+        yield Served(plan, agents, swaps)
 
 
 def planned_workers(
@@ -193,6 +208,14 @@ def _require_fit(plan: ResolvedPlan, deployments: Mapping[str, Deployment]) -> N
             require_match(policy_contract(case.policy.name), env_contract, name)
 
 
+def _local_policy(
+    args: ServerArgs, config: Mapping[str, Any], *, checkpoint_step: int | None = None
+) -> LocalPolicy:
+    """Create a policy in this process, in a sweep over checkpoints with this training step."""
+    step = {} if checkpoint_step is None else {CHECKPOINT_STEP: checkpoint_step}
+    return LocalPolicy(args, {**config, **step})
+
+
 def _variables(config: EvalConfig, local: Mapping[str, partial[LocalPolicy]]) -> dict[str, str]:
     """Return the environment variables that workers and replicas have, and with which this process
     computes the same results.
@@ -221,15 +244,17 @@ def _in_process(
     return config.model_copy(update={"policies": policies}), agents
 
 
-def _serve_on_ray(
+@contextlib.contextmanager
+def _served_on_ray(
     plan: ResolvedPlan,
     deployments: Mapping[str, Deployment],
     address: str | None,
     *,
     replica_per_gpu: bool,
-) -> contextlib.AbstractContextManager[Any]:
-    """Return the context in which Ray serves the policies."""
+) -> Iterator[CheckpointSwaps]:
+    """Serve the policies on Ray within the context, and yield the swaps of their checkpoints."""
     from vlagents_ray.evaluate.plan.cases import most_cpus, most_gpus
+    from vlagents_ray.serve.launch.checkpoint_swaps import ServedCheckpoints
     from vlagents_ray.serve.launch.server import running_server, spread_over_gpus
 
     workers = max(1, plan.workers)
@@ -237,7 +262,16 @@ def _serve_on_ray(
         deployments = spread_over_gpus(deployments, reserved=workers * most_gpus(plan.cases))
     # The number of CPUs that Ray gets is logical: the requested number of workers must fit.
     cpus = max(os.cpu_count() or 1, math.ceil(workers * most_cpus(plan.cases)))
-    return running_server(together(deployments), address=address, num_cpus=cpus, ingress=False)
+    applications = {
+        policy.name: str(policy.url).removeprefix("serve://") for policy in plan.policies
+    }
+    deployed = together(deployments)
+    for policy in plan.policies:
+        if policy.steps:
+            step = {CHECKPOINT_STEP: policy.steps[0]}
+            deployed = with_user_config(deployed, step, applications[policy.name])
+    with running_server(deployed, address=address, num_cpus=cpus, ingress=False) as server:
+        yield ServedCheckpoints(server, applications)
 
 
 def _enter_ray(stack: contextlib.ExitStack, address: str | None = None) -> None:
@@ -281,7 +315,7 @@ def _local_policies(
             )
         if args is None or obstacle or (args.resources.num_gpus and workers is None):
             return None
-        local[name] = partial(LocalPolicy, args, own_settings(app))
+        local[name] = partial(_local_policy, args, own_settings(app))
     return local
 
 
@@ -316,6 +350,12 @@ def _resolve_policy(
     url = policy.url
     if policy.source is not None and "://" in policy.source:
         url = policy.source
+    if url is not None and policy.steps:
+        raise ConfigError(
+            f"policy {policy.name!r}: expected no `steps` with the running server {url}, which has "
+            f"one checkpoint, got {policy.steps}; give its `source`, so that this command serves "
+            "one checkpoint after another, or one policy with a `url` for each checkpoint"
+        )
     if url is not None:
         return _policy_at(url, policy, ask=ask)
     if policy.source is None:
@@ -332,15 +372,17 @@ def _resolve_policy(
     application = re.sub(r"\W+", "-", name.rpartition(":")[2])
 
     # The results record the pattern of the checkpoints, not the step in this deployment.
-    if policy.steps and settings.get(STEP) is None:
-        deployment = with_settings(deployment, {STEP: policy.steps[0]}, steps=True)
+    checkpoint = checkpoint_name(settings)
+    if policy.steps:
+        deployment = with_settings(deployment, {CHECKPOINT_STEP: policy.steps[0]})
+        checkpoint = settings.get(CHECKPOINT)
     deployments[application] = deployment
     return policy.model_copy(
         update={
             "name": name,
             "url": f"serve://{application}",
             "config": settings,
-            "checkpoint": resolved(settings),
+            "checkpoint": checkpoint,
         }
     )
 
@@ -396,6 +438,4 @@ def policy_deployment(
     if policy.config and not source.endswith(YAML_SUFFIXES):
         args = {"config": policy.config}
     deployment = read_deployment(source, args, step_follows=step_follows)
-    return with_settings(
-        deployment, policy.config, steps=bool(policy.steps), step_follows=step_follows
-    )
+    return with_settings(deployment, policy.config, step_follows=step_follows)

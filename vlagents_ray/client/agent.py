@@ -204,10 +204,9 @@ class RemoteAgent(Agent):
     ) -> dict[str, Any]:
         """Begin an episode; `kwargs` are passed to the policy's `reset`.
 
-        `checkpoint` and `checkpoint_step` are not passed to the policy: they select one of
-        `metadata["checkpoints"]`; the returned info contains the name of the selected checkpoint.
-        If `contract`, the contract of the robot or the environment, is given, the server first
-        compares it with the policy's contract. `ContractMismatch` then lists every difference.
+        The returned info contains the name of the policy's checkpoint. If `contract`, the contract
+        of the robot or the environment, is given, the server first compares it with the policy's
+        contract. `ContractMismatch` then lists every difference.
         """
         [info] = self.reset_batch([obs], [instruction], [self], contract=contract, **kwargs)
         if isinstance(info, Exception):

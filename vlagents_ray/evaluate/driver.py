@@ -1,12 +1,17 @@
 """The driver of evaluations and of rollouts: it assigns the jobs of a plan to workers, repeats
 attempts that failed because of infrastructure, and ends the run when too many episodes in a row are
 lost.
+
+A policy in a sweep over checkpoints has one checkpoint at a time. All episodes of a checkpoint end
+before the policy's server loads the next one, so that no episode acts with two.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Protocol
 
 from vlagents_ray.errors import PolicyFailed, from_code
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts
@@ -53,6 +58,31 @@ class Consumer(ABC):
         """
 
 
+class CheckpointSwaps(Protocol):
+    """The servers of the policies in a sweep over checkpoints. No method waits."""
+
+    def begin(self, policy: str, step: int) -> None:
+        """Begin to load the checkpoint of a training step in place of the present one; the server
+        may have it already.
+        """
+
+    def is_done(self, policy: str) -> bool:
+        """Return whether the policy acts with the checkpoint of the last call of `begin`.
+
+        Raises:
+            VLAgentsError: The checkpoint cannot be loaded, or not within a time limit.
+        """
+
+
+@dataclass(slots=True)
+class _Sweep:
+    """The jobs of a policy whose checkpoints are not loaded yet."""
+
+    policy: str
+    later: dict[int, list[Job]] = field(default_factory=dict)  # by step, in the order of the plan
+    swapping_to: int | None = None  # the step that the server is loading
+
+
 class Driver:
     """Assigns the unfinished jobs of a plan to workers, and handles their reports.
 
@@ -60,15 +90,32 @@ class Driver:
     reports, and passes each report to `take`.
     """
 
-    def __init__(self, plan: ResolvedPlan, jobs: Iterable[Job], consumer: Consumer) -> None:
+    def __init__(
+        self,
+        plan: ResolvedPlan,
+        jobs: Iterable[Job],
+        consumer: Consumer,
+        swaps: CheckpointSwaps | None = None,
+    ) -> None:
         """Queue the jobs.
 
         Args:
             plan: The plan of the jobs.
             jobs: The jobs; within each environment, they begin in this order.
             consumer: Receives the results.
+            swaps: Loads the checkpoints of a sweep into its server; None if the workers create
+                agents with the checkpoints themselves.
         """
-        self.queue = JobQueue(jobs)
+        self.queue = JobQueue()
+        self._swaps = swaps
+        self._sweeps: dict[str, _Sweep] = {}
+        for job in jobs:
+            policy, step = job.case.policy.name, job.case.checkpoint_step
+            if step is None:
+                self.queue.put(job)
+            else:
+                sweep = self._sweeps.setdefault(policy, _Sweep(policy))
+                sweep.later.setdefault(step, []).append(job)
         self._retries = plan.retries
         self._abort_after = plan.abort_after
         self._consumer = consumer
@@ -77,8 +124,21 @@ class Driver:
         # Number of steps and digest of the actions of each episode whose simulation diverged.
         self._diverged: dict[EpisodeKey, tuple[int, str | None]] = {}
 
+    @property
+    def waiting(self) -> int:
+        """The number of jobs that no worker has begun."""
+        later = [jobs for sweep in self._sweeps.values() for jobs in sweep.later.values()]
+        return len(self.queue) + sum(map(len, later))
+
     def hand_out(self, pool: Workers) -> None:
-        """Assign waiting jobs to idle workers, and start more workers if they are needed."""
+        """Assign waiting jobs to idle workers, and start more workers if they are needed.
+
+        Raises:
+            VLAgentsError: A checkpoint of a sweep cannot be loaded.
+        """
+        for sweep in self._sweeps.values():
+            self._advance(sweep, pool)
+
         for worker in pool.idle():
             jobs = self.queue.take(worker.kind, worker.env_place, pool.busy_places())
             if jobs:
@@ -90,6 +150,23 @@ class Driver:
             if case is None or not pool.free_slot():
                 return
             pool.start(case)
+
+    def _advance(self, sweep: _Sweep, pool: Workers) -> None:
+        """Queue the jobs of the next step of a sweep, once no other job of its policy is left and
+        its checkpoint is loaded.
+        """
+        if sweep.swapping_to is None:
+            is_busy = self.queue.has_jobs_of(sweep.policy) or sweep.policy in pool.busy_policies()
+            if is_busy or not sweep.later:
+                return
+            sweep.swapping_to = next(iter(sweep.later))
+            if self._swaps is not None:
+                self._swaps.begin(sweep.policy, sweep.swapping_to)
+
+        if self._swaps is None or self._swaps.is_done(sweep.policy):
+            for job in sweep.later.pop(sweep.swapping_to):
+                self.queue.put(job)
+            sweep.swapping_to = None
 
     def take(self, job: Job, report: Report) -> None:
         """Pass the result in a report to the consumer, or repeat the job.

@@ -19,7 +19,7 @@ from vlagents_ray.evaluate.artifacts.storage import (
     storing,
     versions,
 )
-from vlagents_ray.evaluate.driver import Consumer, Driver
+from vlagents_ray.evaluate.driver import CheckpointSwaps, Consumer, Driver
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import EvalConfig
@@ -80,6 +80,7 @@ def evaluate(
     config: EvalConfig,
     *,
     agent_factory: OwnAgents = None,
+    swaps: CheckpointSwaps | None = None,
     progress: Progress | None = None,
     only: tuple[int, int] | None = None,
     end_at: float | None = None,
@@ -98,7 +99,8 @@ def evaluate(
         config: The policies, the envs, and the folder of results.
         agent_factory: A function that each worker calls to create its agent, or a mapping from
             policy names to such functions; by default, an agent is a connection to the policy's
-            `url`.
+            `url`. For a policy with `steps`, the function is called with `checkpoint_step`.
+        swaps: The servers of policies with `steps`, which load one checkpoint after another.
         progress: Shows the progress (see `progress_for`); by default, no progress is shown.
         only: (number, seed) of the only episode that runs in each env; by default, all episodes
             run.
@@ -119,7 +121,12 @@ def evaluate(
             ended with an error of a policy.
     """
     return evaluate_plan(
-        resolve(config), agent_factory=agent_factory, progress=progress, only=only, end_at=end_at
+        resolve(config),
+        agent_factory=agent_factory,
+        swaps=swaps,
+        progress=progress,
+        only=only,
+        end_at=end_at,
     )
 
 
@@ -127,6 +134,7 @@ def evaluate_plan(
     plan: ResolvedPlan,
     *,
     agent_factory: OwnAgents = None,
+    swaps: CheckpointSwaps | None = None,
     progress: Progress | None = None,
     only: tuple[int, int] | None = None,
     end_at: float | None = None,
@@ -138,6 +146,8 @@ def evaluate_plan(
             "vlagents_ray.evaluate.robot"
         )
     factory = agents(plan, agent_factory)
+    if swaps is None:
+        _require_own_agents(plan, agent_factory)
     tracking = TrackerFeed(plan)
 
     with Store(plan) as store:
@@ -147,7 +157,9 @@ def evaluate_plan(
         try:
             with tracking:
                 local = factory_programs(plan, agent_factory)
-                run = _Run(plan, store, progress or Progress(), tracking, only, end_at, local)
+                run = _Run(
+                    plan, store, progress or Progress(), tracking, only, end_at, local, swaps
+                )
                 state, summary = run.play(factory)
         except BaseException:
             # A second disk error probably has the same cause; the first error is reported.
@@ -159,6 +171,20 @@ def evaluate_plan(
         if state == stopped.why:
             raise stopped(summary)
     return summary
+
+
+def _require_own_agents(plan: ResolvedPlan, own: OwnAgents) -> None:
+    """Raise `ConfigError` if a policy has steps but is at the URL of a running server, which has
+    one checkpoint.
+    """
+    for policy in plan.policies:
+        if policy.steps and not callable(own) and policy.name not in (own or {}):
+            raise ConfigError(
+                f"policy {policy.name!r}: expected no `steps` with the `url` of a running server, "
+                f"which has one checkpoint, got {policy.steps}; give its `source`, so that the "
+                "evaluation serves one checkpoint after another, or one policy with a `url` for "
+                "each checkpoint"
+            )
 
 
 def conclude(store: Store, state: str) -> Summary:
@@ -207,6 +233,7 @@ class _Run(Consumer):
         only: tuple[int, int] | None,
         end_at: float | None,
         local_programs: Mapping[str, Program],
+        swaps: CheckpointSwaps | None,
     ) -> None:
         """Queue the episodes without a result.
 
@@ -218,6 +245,7 @@ class _Run(Consumer):
             only: As in `evaluate`.
             end_at: As in `evaluate`.
             local_programs: The files of agents that the workers create, by policy.
+            swaps: As in `evaluate`.
         """
         self._plan = plan
         self._store = store
@@ -238,7 +266,7 @@ class _Run(Consumer):
             is_selected = only in (None, (job.key.episode, job.key.seed))
             if is_selected and str(job.key) not in finished and self.is_needed(job):
                 pending.append(job)
-        self._driver = Driver(plan, pending, self)
+        self._driver = Driver(plan, pending, self, swaps)
         # Number of remaining episodes by case.
         self._left = Counter(job.key.settings for job in pending)
         self._deadline = Deadline(end_at, (episode.result.seconds for episode in results.episodes))
@@ -252,19 +280,20 @@ class _Run(Consumer):
         Returns:
             The state of the run, and its summary.
         """
-        queue = self._driver.queue
-        if not len(queue):
+        driver = self._driver
+        if not driver.waiting:
             return "complete", conclude(self._store, "complete")
 
         with contextlib.ExitStack() as stack:
             pool_of = workers_class(self._plan, stack)
             stop = stack.enter_context(stop_signals())
-            self._progress.begin(self._plan.cases, self._recorded, len(queue))
+            self._progress.begin(self._plan.cases, self._recorded, driver.waiting)
             try:
                 with pool_of(self._plan, factory) as pool:
                     try:
                         while not stop.is_set() and not self._deadline.is_over:
-                            if not pool.busy and not (len(queue) and self._deadline.leaves_room):
+                            may_begin = driver.waiting and self._deadline.leaves_room
+                            if not pool.busy and not may_begin:
                                 break
                             self._poll_pool(pool, stop)
                         if not stop.is_set():
@@ -280,7 +309,7 @@ class _Run(Consumer):
                             error,
                         )
 
-                    state = OutOfTime.why if len(queue) or pool.busy else "complete"
+                    state = OutOfTime.why if driver.waiting or pool.busy else "complete"
                     if stop.is_set():
                         state = EvaluationInterrupted.why
                     return state, conclude(self._store, state)
@@ -290,6 +319,8 @@ class _Run(Consumer):
     def _poll_pool(self, pool: Workers, stop: StopRequest) -> None:
         if self._deadline.leaves_room:
             self._driver.hand_out(pool)
+            if not pool.busy and not len(self._driver.queue):  # a server loads a checkpoint
+                stop.wait(POLL_S)
         late_s = SIGNAL_S
         for job, report in pool.wait(POLL_S):
             self._deadline.end(job)

@@ -458,6 +458,13 @@ def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
     return _get_global_client(), proxies
 
 
+def serve_client() -> Any:
+    """Return the client of the Serve that this process has started or joined."""
+    from ray.serve.context import _get_global_client
+
+    return _get_global_client()
+
+
 def proxies_now(client: Any) -> list[Any]:
     """Return the refs of Serve's current proxies, which may have replaced the proxies from
     `start_serve`.

@@ -81,9 +81,9 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         # only these checks limit the time of a call. The failed checks take as long together as the
         # time limit of a call; with Serve's defaults they would take 95 s for every policy.
         "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
-        # A policy that failed to load once will fail again. While other replicas run, Serve ignores
-        # this limit and retries forever.
-        "max_constructor_retry_count": 1,
+        # A replica may be killed while it loads, so Serve starts a second one. While other replicas
+        # run, Serve ignores this limit and retries forever.
+        "max_constructor_retry_count": 2,
         # Settings of the policy that a deployment file may contain next to `args`; they can change
         # without a restart.
         "user_config": {},

@@ -18,7 +18,7 @@ from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.in_time import describe
-from vlagents_ray.serve.models.checkpoints import resolved
+from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
 from vlagents_ray.serve.sessions import SessionFinder
@@ -54,8 +54,8 @@ def build_engine(
         in_flight_bytes=args.limits.in_flight_bytes,
         threaded=threaded,
     )
-    checkpoints = args.checkpoints.of(partial(make_agent, args), config)
-    return Engine(checkpoints, settings, finder=finder)
+    policy = PolicySource(partial(make_agent, args), config)
+    return Engine(policy, settings, finder=finder)
 
 
 def policy_metadata(
@@ -69,24 +69,23 @@ def policy_metadata(
         code: The git state of the policy's code, see `ServerArgs.code`.
         program: The digests of the policy's files, see `ServerArgs.code`.
     """
-    contract, models = engine.contract, engine.models
+    contract, model = engine.contract, engine.model
     return {
         "policy": args.policy,
-        "checkpoint": resolved(models.config),
-        "weights": models.weights,
-        "devices": models.devices,
+        "checkpoint": model.checkpoint,
+        "weights": model.weights,
+        "devices": model.devices,
         "policy_version": engine.weights.describe(),
-        "checkpoints": models.describe(),
-        "config": models.config,
+        "config": model.config,
         "wrappers": args.wrappers,
         "contract": None if contract is None else contract.to_json(),
-        "continues_plans": models.continues_plans,
-        "longest_prefix": models.longest_prefix,
+        "continues_plans": model.continues_plans,
+        "longest_prefix": model.longest_prefix,
         "reads_slo": True,  # selected at a reset
         "slo": None if args.slo is None else args.slo.objective().to_json(),
         "version": importlib.metadata.version("vlagents-ray"),
         "code": None if code is None else code.to_json(),
-        "program": program | models.files,
+        "program": program | model.files,
         "batch_costs": engine.queue.window.describe_costs(),
         "load": engine.pace.load().load,
         "robots": describe(engine.sessions.times(), engine.clock()),

@@ -55,29 +55,6 @@ longer than that, and the check takes about 2 us.
 """
 
 
-@dataclass(frozen=True, slots=True)
-class CheckpointChoice:
-    """The checkpoint that a session has requested; by default, the deployment's own checkpoint."""
-
-    # Name of one of the deployment's `choices`; None for the deployment's own checkpoint.
-    name: str | None = None
-    # Training step of the checkpoint; None for the step in the settings.
-    step: int | None = None
-
-    def __str__(self) -> str:
-        if self == DEFAULT:
-            return "the deployment's own checkpoint"
-        parts = []
-        if self.name is not None:
-            parts.append(repr(self.name))
-        if self.step is not None:
-            parts.append(f"step {self.step}")
-        return f"checkpoint {' at '.join(parts)}"
-
-
-DEFAULT = CheckpointChoice()
-
-
 @dataclass(slots=True, eq=False)
 class Origin:
     """The origin of one sender's requests."""
@@ -108,7 +85,6 @@ NOWHERE = Origin()
 class Opening:
     """The server's decisions about the episode that a reset begins."""
 
-    choice: CheckpointChoice
     kwargs: dict[str, Any]  # the request's options for the policy
     follows: bool  # whether the episode uses the newest version of the weights
     first: int  # step at which the episode begins
@@ -155,9 +131,6 @@ class PendingRequest:
     sought: bool = False  # whether other replicas were searched for the request's session
     # The reservation of an act or a reset, made before it was queued; see `Intake.reserve`.
     reserved: ReservedAct | Opening | None = None
-    # If a reset had to wait for its checkpoint: the time at which the checkpoint was loaded, s.
-    # Such a reset runs even if it is over, so that the checkpoint is released.
-    loaded: float | None = None
     # Recent time from an answer to the session's next request, s; None if it is unknown.
     return_s: float | None = None
     index: int = 0  # index of the request in its message

@@ -64,8 +64,6 @@ class SessionState:
     # duration, since the clocks of replicas differ.
     age_s: float
     policy: Sequence[str]  # version of the policy and of its shared objects
-    choice: Sequence[Any]  # fields of the session's `CheckpointChoice`
-    settings: dict[str, Any]  # settings of the session's checkpoint
     weights: Sequence[Any]  # number and fingerprint of the session's version of the weights
     follows: bool
     instruction: str
@@ -97,7 +95,7 @@ class Session(Generic[M]):
     prepares: Prepares | None = None
     # Observations that wait for the acts that refer to them, and their preparations, by number.
     stored: dict[int, tuple[Obs, Preparation | None]] = field(default_factory=dict)
-    # Model of which `agent` is a copy; only the model manager and its cache set it.
+    # Model of which `agent` is a copy; None before the first reset, and after the session's end.
     model: M | None = None
     weights: WeightsVersion | None = None  # version of the weights with which the session acts
     instruction: str = ""  # instruction of the session's last reset
@@ -105,7 +103,6 @@ class Session(Generic[M]):
     # version.
     follows: bool = True
     over: bool = False  # whether the session has ended, so that no table contains it
-    resetting: PendingRequest | None = None  # reset that waits for its checkpoint
     # Origin of the session's last request. Without an owner, the session ends when it is closed or
     # idle for too long.
     origin: Origin = NOWHERE
@@ -180,13 +177,6 @@ class SessionFinder(Protocol):
         """
 
 
-class SessionModels(Protocol[M]):
-    """The models that sessions hold: `vlagents_ray.serve.models.model_manager.ModelCache`."""
-
-    def release_model(self, session: Session[M]) -> bool:
-        """Release the model that the session holds; return whether the session held a model."""
-
-
 class SessionTable(Generic[M]):
     """The sessions of a replica, by id. Thread-safe.
 
@@ -201,7 +191,6 @@ class SessionTable(Generic[M]):
         limit: int,
         idle_s: float,
         clock: Callable[[], int] = time.time_ns,
-        models: SessionModels[M] | None = None,
     ) -> None:
         """Create an empty table.
 
@@ -209,9 +198,7 @@ class SessionTable(Generic[M]):
             limit: Largest number of sessions.
             idle_s: Time without a request after which a session may be dropped, s.
             clock: Wall clock, ns.
-            models: The models that the sessions hold; None if sessions hold no models.
         """
-        self._models = models
         self._sessions: dict[str, Session[M]] = {}
         self._expected: list[Session[M]] = []  # sessions that are arriving from other replicas
         self.limit = limit
@@ -301,7 +288,6 @@ class SessionTable(Generic[M]):
             session.expected = max(session.expected, first)
             session.began = reset.arrived
             session.last_reset = max(session.last_reset, reset.arrived)
-            session.resetting = reset
 
     def undo(
         self,
@@ -487,12 +473,15 @@ class SessionTable(Generic[M]):
                     # Setting this makes a waiting reset void.
                     self._forget(session_id, (max(session.steps, session.expected), _ANY))
 
-    def close_those_of(self, model: M) -> None:
-        """Close all sessions of a model."""
+    def close_all(self) -> None:
+        """Close all sessions, and drop their agents, since the model of these agents is closed.
+        Only the policy's thread calls this method.
+        """
         with self._lock:
-            of_model = [session for session in self._sessions.values() if session.model is model]
-            for session in of_model:
+            for session in list(self._sessions.values()):
                 self._forget(session.id)
+                session.set_agent(None)
+                session.weights = None
 
     def all(self) -> list[Session[M]]:
         """Return all sessions. The method takes no lock, so callers may hold locks."""
@@ -542,8 +531,7 @@ class SessionTable(Generic[M]):
         """Mark a removed session as ended; the caller holds the lock."""
         session.over = True
         session.stored.clear()
-        if self._models is not None:
-            self._models.release_model(session)
+        session.model = None
 
     def _remember(self, session_id: str, version: Version) -> None:
         self._left[session_id] = max(version, self._left.pop(session_id, version))

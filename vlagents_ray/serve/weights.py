@@ -689,11 +689,11 @@ class HeldVersion:
 
 
 class OwnWeights(Protocol):
-    """The part of `ModelManager` that concerns weights."""
+    """The part of `ServedModel` that concerns weights."""
 
     @property
     def own_weights(self) -> ModelWeights:
-        """The weights of the deployment's own model; raises `PolicyUnavailable` while it loads."""
+        """The weights of the loaded model; raises `PolicyUnavailable` while it loads."""
 
 
 class AllSessions(Protocol):
@@ -708,16 +708,16 @@ class WeightUpdates:
 
     def __init__(
         self,
-        models: OwnWeights,
+        model: OwnWeights,
         sessions: AllSessions,
     ) -> None:
         """Update the weights of a replica.
 
         Args:
-            models: Contains the weights of the deployment's own model.
+            model: Contains the weights of the loaded model.
             sessions: The sessions that use these weights.
         """
-        self._models, self._sessions = models, sessions
+        self._model, self._sessions = model, sessions
         # Held while the policy's thread runs a batch, and while the policy sleeps.
         self.acting_lock = threading.Lock()
         self._resting = threading.RLock()  # held during each step of a rest
@@ -729,7 +729,7 @@ class WeightUpdates:
 
     def current(self) -> ModelWeights:
         """Return the weights; raise `PolicyUnavailable` while the policy loads."""
-        return self._models.own_weights
+        return self._model.own_weights
 
     def stage(
         self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions

@@ -31,8 +31,6 @@ class VlagentsConfig(PreTrainedConfig):
     instruction: str | None = None  # replaces the task of the dataset or the environment
     # Number of rows of each chunk that are executed; None for all rows that the server returns.
     n_action_steps: int | None = None
-    # One of the checkpoints that the server offers; None for the server's default.
-    checkpoint: str | None = None
     # Seed of the first session's first episode; the seed increases by one with each further
     # episode.
     seed: int | None = None

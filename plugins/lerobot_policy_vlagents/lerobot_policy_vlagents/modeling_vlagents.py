@@ -72,8 +72,7 @@ class VlagentsPolicy(PreTrainedPolicy):
         if pretrained_name_or_path is not None or config is None:
             raise ConfigError(
                 "policy.path: expected none with policy.type=vlagents, as the server loads the "
-                f"checkpoint, got {str(pretrained_name_or_path)!r}; --policy.checkpoint selects "
-                f"one of the server's checkpoints"
+                f"checkpoint, got {str(pretrained_name_or_path)!r}; --policy.url selects the server"
             )
         return cls(config, **{key: value for key, value in kwargs.items() if key == "dataset_meta"})
 
@@ -337,16 +336,11 @@ class _Sessions:
             if self._config.seed is None
             else [self._config.seed + self._begun + row for row in range(size)]
         )
-        options: dict[str, Any] = (
-            {} if self._config.checkpoint is None else {"checkpoint": self._config.checkpoint}
-        )
         observations = [mapping.observation(batch, row) for row in range(size)]
         self._fit = fit = self._robot.fit(self.agent, mapping)
         for obs in observations:
             fit.require(obs, None)
-        _successes(
-            self.agent.reset_batch(observations, tasks, self._agents, seeds=seeds, **options)
-        )
+        _successes(self.agent.reset_batch(observations, tasks, self._agents, seeds=seeds))
         self._begun += size
         self._rows = [deque() for _ in range(size)]
         self._ticks = [[0, 0] for _ in range(size)]

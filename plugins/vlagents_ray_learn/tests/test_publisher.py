@@ -75,7 +75,7 @@ def test_a_part_of_the_weights_leaves_the_rest(engine: Engine) -> None:
 def test_mistakes_are_refused_by_name(engine: Engine) -> None:
     weights = Publisher(engine)
     with pytest.raises(UnchangedWeights):
-        weights.push(engine.models.own_weights._trainable.parameters())
+        weights.push(engine.model.own_weights._trainable.parameters())
     with pytest.raises(InvalidWeights, match=r"expected values by name, .*got list"):
         weights.push([np.zeros(2)])  # type: ignore[arg-type]
     with pytest.raises(InvalidInput, match=r"mode: expected .*, got 'abort'"):

@@ -216,7 +216,7 @@ def test_all_memory_on_the_gpu_moves_to_the_host_and_back(
     engine = serving(agent)
     weights = Publisher(engine)
     weights.push({"bias": torch.full((4,), 7.0)}, partial=True)  # held beside the version that acts
-    own, before = engine.models.own_weights, acted(engine)
+    own, before = engine.model.own_weights, acted(engine)
     memories = [
         one.untyped_storage() for one in (*agent.parameters().values(), *own.newest.values.values())
     ]

@@ -316,7 +316,7 @@ def test_weights_of_another_checkpoint_are_neither_taken_nor_mixed(app: Applicat
     app.start(Gain())
     app.push(5)
     [other] = app.start(Gain())
-    other.engine.models.own_weights.model = ("its settings", "its digest")
+    other.engine.model.own_weights.model = ("its settings", "its digest")
     assert app.catch_up(other) == 0
     with pytest.raises(PolicyUnavailable, match="changing their checkpoint"):
         app.push(6)

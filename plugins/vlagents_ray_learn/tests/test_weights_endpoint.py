@@ -133,10 +133,10 @@ def test_a_learner_elsewhere_pushes_and_asks_which_replicas_act_with_it(serving:
             0,
         )
         assert weights.push(gains(1), version=500, allow_same=True) == 500
-    held = server.engine.models.own_weights._trainable.tree
+    held = server.engine.model.own_weights._trainable.tree
     assert server.engine.weights.describe()["newest"]["version"] == 500
     assert held["offset"].tolist() == [0, 0]  # no session has begun since
-    newest = server.engine.models.own_weights.newest.values
+    newest = server.engine.model.own_weights.newest.values
     assert (newest["gain"][0], newest["gain"][-1], newest["offset"][0]) == (1, 1, 1)
 
 
@@ -157,7 +157,7 @@ def test_values_that_are_received_are_not_copied_again(
 ) -> None:
     server = serving()
     received: list[Mapping[str, Any]] = []
-    own = server.engine.models.own_weights
+    own = server.engine.model.own_weights
     stage = own.stage
     monkeypatch.setattr(
         own, "stage", lambda *args, **how: (received.append(args[1]), stage(*args, **how))[1]
@@ -329,7 +329,7 @@ def test_a_push_that_dies_half_way_leaves_nothing_behind(serving: Serving) -> No
             return False
 
     wait_for(pushed)
-    assert server.engine.models.own_weights._staged is None
+    assert server.engine.model.own_weights._staged is None
 
 
 def test_a_learner_that_is_silent_is_not_waited_for(serving: Serving) -> None:
@@ -423,7 +423,7 @@ def test_an_error_of_the_server_itself_is_not_shown(
     def fail(*args: Any, **how: Any) -> str:
         raise RuntimeError("secret")
 
-    monkeypatch.setattr(server.engine.models.own_weights, "stage", fail)
+    monkeypatch.setattr(server.engine.model.own_weights, "stage", fail)
     with pytest.raises(VLAgentsError, match="internal error"):
         Publisher(server.url).push(gains(1))
 
@@ -433,7 +433,7 @@ def test_a_push_whose_learner_leaves_after_the_last_part_is_completed(
 ) -> None:
     server = serving()
     begun, may_go_on = threading.Event(), threading.Event()
-    own = server.engine.models.own_weights
+    own = server.engine.model.own_weights
     stage = own.stage
     monkeypatch.setattr(
         own, "stage", lambda *args, **how: (begun.set(), may_go_on.wait(30), stage(*args, **how))[2]

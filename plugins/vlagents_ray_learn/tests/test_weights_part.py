@@ -189,7 +189,7 @@ def test_a_replica_becomes_ready_if_the_others_weights_cannot_be_taken(
     def fail(*args: Any) -> str:
         raise RuntimeError("the disk is full")
 
-    monkeypatch.setattr(late.engine.models.own_weights, "stage", fail)
+    monkeypatch.setattr(late.engine.model.own_weights, "stage", fail)
     asyncio.run(late.parts.before_ready())
     assert late.acted() == (0, 0.0)
     assert "tried again later" in caplog.text

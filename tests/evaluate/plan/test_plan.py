@@ -53,7 +53,7 @@ def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> 
         return usual.model_copy(update={"policies": [PolicyConfig.model_validate(given)]})
 
     [case] = plan_cases(pushed("a"))
-    assert (case.policy_id, case.policy_options) == ("policy@3", {}), (
+    assert (case.policy_id, case.checkpoint_step) == ("policy@3", None), (
         "no checkpoint is requested from the policy"
     )
     assert len({str(key) for one in (usual, pushed("a"), pushed("b")) for key in keys(one)}) == 6
@@ -71,10 +71,7 @@ def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
         ("policy@20", LINE),
         ("policy@20", OTHER_LINE),
     ]
-    assert [job.case.policy_options for job in jobs[::2]] == [
-        {"checkpoint_step": 10},
-        {"checkpoint_step": 20},
-    ]
+    assert [job.case.checkpoint_step for job in jobs[::2]] == [10, 20]
     assert len({str(job.key) for job in jobs}) == 4
     assert jobs[0].case.place == jobs[2].case.place, "checkpoints share the environment of a worker"
 
@@ -84,7 +81,7 @@ def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
     [
         {"policy": "other"},
         {"policy_config": {"speed": 2}},
-        {"policy_options": {"checkpoint_step": 2}},
+        {"policy_options": {"temperature": 2}},
         {"checkpoint": "step-100"},
         {"env_options": {"width": 128}},
         {"reset_options": {"layout": 1}},
@@ -261,7 +258,7 @@ def test_a_batch_has_no_latency_to_measure() -> None:
             "policies: expected different names",
         ),
         (
-            {"policy_options": {"seed": 3, "checkpoint_step": 20}},
+            {"policy_options": {"seed": 3, "temperature": 2}},
             r"expected no options that the evaluation sets for each episode, got \['seed'\]",
         ),
     ],

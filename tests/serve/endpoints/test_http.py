@@ -260,7 +260,7 @@ def test_health_and_refusals_name_the_step_of_a_long_start() -> None:
             policy.go_on.set()
             starting.join()
         assert client.get("/healthz").text == "OK\n"
-        assert engine.models.uncompiled == ["2 rows"]
+        assert engine.model.uncompiled == ["2 rows"]
     engine.close()
 
 

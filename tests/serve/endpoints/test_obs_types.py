@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import collections
 import json
-import queue
 import struct
 import zlib
 from collections.abc import Iterator
@@ -15,20 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 from dialect_server import client_of
-from in_flight import send
 from starlette.testclient import TestClient
 
-from vlagents_ray.contract import Contract, StateSpec
-from vlagents_ray.errors import InvalidInput, VLAgentsError
+from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_requests
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Reply, Request
-from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.models.checkpoints import Checkpoints
 
 
 def require_types(obs: Obs) -> None:
@@ -157,8 +151,6 @@ FIELDS = [
     "instruction",
     "kwargs",
     "kwargs.weights",
-    "kwargs.checkpoint",
-    "kwargs.checkpoint_step",
     "kwargs.seed",
     "contract",
     "contract.action",
@@ -269,55 +261,3 @@ def test_an_answer_is_the_same_in_json_and_in_a_frame(client: TestClient) -> Non
     answer = client.post("/v1/act", headers={"x-session-id": "j"}, json={})
     assert answer.status_code == 200
     assert answer.json()["info"].items() >= {"last": [1, 2], "some": [0, 1, 2]}.items()
-
-
-class Joints(Agent):
-    def __init__(self, dim: int = 0) -> None:
-        self.dim = dim
-
-    @property
-    def contract(self) -> Contract | None:
-        return Contract(state={"joints": StateSpec(dim=self.dim)}) if self.dim else None
-
-    def act(self, obs: Obs) -> Act:
-        assert not self.dim or len(obs.state["joints"]) == self.dim
-        return Act(np.zeros(2, np.float32))
-
-
-@pytest.mark.parametrize("order", [("own", "arm7"), ("arm3", "arm7"), ("own", "arm3")])
-def test_an_act_behind_a_reset_is_checked_against_the_contract_of_that_reset(
-    order: tuple[str, str],
-) -> None:
-    """The act arrives in the same frame, while the session still uses the earlier checkpoint, whose
-    contract is checked first.
-    """
-    choices = {"arm7": {"dim": 7}, "arm3": {"dim": 3}}
-    engine = Engine(Checkpoints(lambda config: Joints(config.get("dim", 0)), {}, choices))
-    engine.start()
-    sender = Sender(engine, "websocket", caller=NoKey.OPEN, has_left=None)
-    observations = {n: Obs(state={"joints": np.zeros(n, np.float32)}) for n in (3, 7)}
-
-    def ask(*requests: Request) -> list[Reply]:
-        answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
-        send(sender, list(requests), answers.put)
-        return answers.get(timeout=20)
-
-    def reset(name: str) -> Request:
-        length = choices.get(name, {"dim": 3})["dim"]
-        return Request(
-            "reset",
-            observations[length],
-            kwargs={} if name == "own" else {"checkpoint": name},
-            session="s",
-        )
-
-    first, second = order
-    for name in (second, first):  # load both checkpoints
-        assert ask(reset(name))[0].error is None
-    fitting_first, wrong_second = (3, 7) if second == "arm3" else (3, 3)
-    assert ask(Request("act", observations[fitting_first], session="s"))[0].error is None
-    answers = ask(reset(second), Request("act", observations[wrong_second], session="s"))
-    assert answers[0].error is None
-    assert isinstance(answers[1].error, InvalidInput)
-    assert f"expected shape ({choices[second]['dim']},)" in str(answers[1].error)
-    engine.close()

@@ -242,7 +242,7 @@ def test_a_loading_policy_is_unavailable_and_a_broken_one_says_why() -> None:
     with pytest.raises(PolicyFailed, match=r"no such checkpoint \(test_engine.py:\d+\)$"):
         engine.start()
     # Paths never leave the server.
-    with pytest.raises(PolicyFailed, match="did not load: FileNotFoundError; the server"):
+    with pytest.raises(PolicyUnavailable, match="did not load: FileNotFoundError; the server"):
         ask(engine, "a", "reset")
 
 

@@ -367,7 +367,7 @@ class Executed(list[str]):
     """Executed operations of all sessions."""
 
 
-STEPS = {"reset": ("take", "run", "hold", "begin_episode"), "act": ("take", "run", "ready", "act")}
+STEPS = {"reset": ("take", "run", "reset"), "act": ("take", "run", "ready", "act")}
 
 
 @pytest.mark.parametrize(
@@ -388,8 +388,7 @@ def test_no_request_is_executed_of_which_a_deadline_said_that_it_never_will_be(
     owner, method = {
         "take": (engine.queue, "take"),
         "run": (engine.runner, "_run"),
-        "hold": (engine.models, "hold"),
-        "begin_episode": (engine.runner, "_begin_episode"),
+        "reset": (engine.runner, "_reset"),
         "ready": (engine.runner, "_ready"),
         "act": (engine.runner, "_act"),
     }[step]

@@ -5,7 +5,6 @@ starts.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +14,20 @@ from certificates import authority
 
 from vlagents_ray import ConfigError
 from vlagents_ray.registry import requirements_file
-from vlagents_ray.serve.launch.deployment_file import deployment, read_deployment
+from vlagents_ray.serve.launch.deployment_file import (
+    deployment,
+    own_settings,
+    read_deployment,
+    together,
+    with_user_config,
+)
 from vlagents_ray.serve.launch.haproxy import Tls
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.ports import EVERYWHERE
 
 ROOT = Path(__file__).parents[3]
 STORED = "served_agents:Stored"
+STEPPED = {"checkpoint": "/runs/{step}", "checkpoint_step": 1}
 
 
 def application(args: str) -> str:
@@ -101,22 +107,17 @@ def test_every_shipped_deployment_file_is_valid(file: Path, tmp_path: Path) -> N
     assert read_deployment(str(here)).applications
 
 
-@pytest.mark.parametrize(
-    "read",
-    [
-        lambda config: deployment(
-            STORED, config=config, checkpoints={"choices": {"a": {"scales": 1}}}
-        ),
-        lambda _: deployment("noop", checkpoints={"steps": True}),
-        lambda config: deployment(STORED, config=config, checkpoints={"loaded": 0}),
-    ],
-    ids=["setting", "steps", "loaded"],
-)
-def test_checkpoints_that_cannot_be_chosen_are_refused(
-    read: Callable[[dict[str, Any]], Any],
-) -> None:
-    with pytest.raises(ConfigError):
-        read({"checkpoint": "x"})
+def test_a_user_config_is_set_for_one_application_and_checked() -> None:
+    both = together({name: deployment(STORED, config=STEPPED) for name in ("a", "b")})
+    changed = with_user_config(both, {"checkpoint_step": 2}, "b")
+    assert [own_settings(app)["checkpoint_step"] for app in changed.applications] == [1, 2]
+    again = with_user_config(changed, {"scale": 3.0})
+    assert [own_settings(app) for app in again.applications] == [
+        STEPPED | {"scale": 3.0},
+        STEPPED | {"checkpoint_step": 2, "scale": 3.0},
+    ]
+    with pytest.raises(ConfigError, match="scales"):
+        with_user_config(both, {"scales": 3.0})
 
 
 def test_nothing_starts_without_keys_off_loopback_or_certificates_or_on_ipv6(

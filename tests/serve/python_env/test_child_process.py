@@ -53,13 +53,13 @@ from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.ability_call import is_method, name_of
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
-from vlagents_ray.serve.models import model_manager
+from vlagents_ray.serve.models import served_model
 from vlagents_ray.serve.python_env.child_agent import ChildAgent
 from vlagents_ray.serve.python_env.child_connection import ChildConnection
 from vlagents_ray.serve.python_env.child_main import Settings
 from vlagents_ray.serve.python_env.child_process import ChildProgram
 from vlagents_ray.serve.queue.call_limits import FAILED_BATCHES, CallLimits
-from vlagents_ray.serve.requests import DEFAULT, ReservedAct
+from vlagents_ray.serve.requests import ReservedAct
 from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import NotShared, shared
@@ -119,7 +119,7 @@ def ask_all(engine: Engine, requests: list[tuple[str, Request]]) -> list[Reply]:
 
 
 def test_what_was_loaded_there_is_known_here(engine: Engine) -> None:
-    told = engine.models.weights
+    told = engine.model.weights
     assert told["digest"]
     assert (ask(engine, "weights", "reset").info or {})["weights"] == told["digest"]
     assert engine.contract.action.dim == 1
@@ -352,16 +352,16 @@ def test_an_observation_that_is_acted_on_again_is_sent_again(
 def test_the_memory_of_the_childs_gpu_is_the_replicas(
     preparing: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert preparing.models.gpu_memory() == {}, "the child has no GPU"
+    assert preparing.model.gpu_memory() == {}, "the child has no GPU"
     both = Engine(agent())
     both.start()
     try:
         held = {"allocated": 5, "reserved": 7, "free": 9}
         monkeypatch.setattr(ChildAgent, "gpu_memory", lambda _: held)
-        assert both.models.gpu_memory() == held
+        assert both.model.gpu_memory() == held
         here = {"allocated": 1, "reserved": 2, "free": 3}
-        monkeypatch.setattr(model_manager, "gpu_memory", lambda _: here)
-        assert both.models.gpu_memory() == {"allocated": 6, "reserved": 9, "free": 3}
+        monkeypatch.setattr(served_model, "gpu_memory", lambda _: here)
+        assert both.model.gpu_memory() == {"allocated": 6, "reserved": 9, "free": 3}
     finally:
         both.close()
 
@@ -391,7 +391,7 @@ def test_what_the_child_does_on_its_gpu_is_in_the_metrics_of_the_replica() -> No
 def test_a_child_that_has_ended_leaves_the_other_metrics_of_the_replica() -> None:
     engine = Engine(agent("OnGpu"))
     engine.start()
-    child = engine.models.loaded(DEFAULT).agent.child
+    child = engine.model.loaded.agent.child
     child.process._process.kill()
     wait_for(lambda: child.process._process.poll() is not None, 10)
     engine.stats.out_of_memory()
@@ -404,7 +404,7 @@ def test_a_child_whose_batches_all_fail_is_replaced_as_a_replica_is() -> None:
     one = Engine(agent())
     one.start()
     ask(one, "a", "reset", instruction="a task")
-    process = one.models.loaded(DEFAULT).agent.child.process
+    process = one.model.loaded.agent.child.process
     for _ in range(FAILED_BATCHES):
         [reply] = ask_all(one, [("a", Request("act", observation(fails=True)))])
         assert isinstance(reply.error, PolicyFailed)
@@ -579,7 +579,7 @@ def test_a_policy_without_an_ability_has_none_in_its_process(
 
 
 def test_an_ability_of_the_loaded_policy_is_used_while_it_acts(able: Engine) -> None:
-    loaded = able.models.loaded(DEFAULT).agent
+    loaded = able.model.loaded.agent
     found: Any = ability(loaded, Dances)
     assert found.rest(2.5) == ["rest", None, [2.5], {}]
     with pytest.raises(NotReset, match="dance before reset"):
@@ -594,7 +594,7 @@ def test_a_call_of_the_loaded_policy_does_not_wait_for_a_running_act() -> None:
     replies: list[Reply] = []
     submit(one, "a", Request("act", observation()), replies.append)
     wait_for(lambda: one.calls.under_way, 10)
-    loaded: Any = ability(one.models.loaded(DEFAULT).agent, Dances)
+    loaded: Any = ability(one.model.loaded.agent, Dances)
     assert loaded.rest(0.0) == "rested"
     wait_for(lambda: replies, 10)
     assert replies[0].error is None
@@ -605,7 +605,7 @@ def test_a_call_of_the_loaded_policy_does_not_wait_for_a_running_act() -> None:
 def test_an_error_of_a_call_of_the_loaded_policy_arrives_with_its_code() -> None:
     one = Engine(agent("ActsAfterRest"))
     one.start()
-    loaded: Any = ability(one.models.loaded(DEFAULT).agent, Dances)
+    loaded: Any = ability(one.model.loaded.agent, Dances)
     for seconds, message in [(-1.0, "ValueError"), (1.0, "cannot be sent"), (2.0, "SystemExit")]:
         with pytest.raises(PolicyFailed, match=message) as error:
             loaded.rest(seconds)

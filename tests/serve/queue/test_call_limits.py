@@ -39,7 +39,6 @@ from vlagents_ray.serve.queue.call_limits import (
     PolicyCall,
     PolicyCalls,
 )
-from vlagents_ray.serve.requests import DEFAULT
 
 LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
 
@@ -226,7 +225,7 @@ def test_every_batch_size_may_compile_where_batches_have_fixed_sizes(
     engine.start()
     hang(engine, "act")
     [call] = engine.calls.under_way
-    model = engine.models.loaded(DEFAULT)
+    model = engine.model.loaded
     assert call is model.call("act", 1)
     assert (call.limit_s, model.call("act", 2).limit_s) == (10.0, 100.0)
     agent.over.set()
@@ -265,7 +264,7 @@ def test_an_engine_whose_policy_hangs_ends_all_the_same(
     engine.start()
     # Without this, `stop` would wait for the batch, although not forever.
     monkeypatch.setattr(engine, "stop", lambda **_: None)
-    monkeypatch.setattr("vlagents_ray.serve.models.model_manager._CLOSE_S", 0.05)
+    monkeypatch.setattr("vlagents_ray.serve.models.served_model._CLOSE_S", 0.05)
     ask(engine, "bad", "reset", hangs_at="act")
     put(engine, "bad", "act")
     wait_for(lambda: engine.calls.under_way)

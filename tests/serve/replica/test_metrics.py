@@ -38,7 +38,7 @@ def test_the_series_of_a_gpu_have_values_only_with_one(monkeypatch: pytest.Monke
     of_gpu = {"gpu_memory_bytes", "gpu_ms", "graph_replays"}
     assert written.keys() & of_gpu == set()
     assert written["utilisation"]
-    monkeypatch.setattr(engine.models, "gpu_memory", lambda: {"free": 7, "reserved": 5})
+    monkeypatch.setattr(engine.model, "gpu_memory", lambda: {"free": 7, "reserved": 5})
     engine.stats.gpu(3.5)
     CudaGraph.replays += 2
     exporter.export()
@@ -50,7 +50,7 @@ def test_the_series_of_a_gpu_have_values_only_with_one(monkeypatch: pytest.Monke
     }
 
     work = GpuWork(passes_ms=[1.5], last_ms=1.5, out_of_memory=3, replays=4)
-    monkeypatch.setattr(engine.models, "gpu_work_elsewhere", lambda: [work])
+    monkeypatch.setattr(engine.model, "gpu_work_elsewhere", lambda: work)
     exporter.export()
     assert written["gpu_ms"][1:] == [(1.5,)]
     assert written["graph_replays"][1:] == [(4,)]

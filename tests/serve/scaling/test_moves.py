@@ -95,7 +95,7 @@ class Moves(RuleBasedStateMachine):
         self.names = {name: f"{example}-{name}" for name in _NAMES}
         self.open: dict[str, _Session] = {}
         self.newest = self.served.engines[0].weights.number
-        self.pinned = self.served.engines[0].models.own_weights.pinned.number
+        self.pinned = self.served.engines[0].model.own_weights.pinned.number
 
     @rule(name=st.sampled_from(_NAMES), at=st.sampled_from([0, 1]), follows=st.booleans())
     def reset(self, name: str, at: int, follows: bool) -> None:
@@ -270,7 +270,7 @@ def test_sessions_move_with_weights_that_no_other_session_uses(
             engine.weights.commit(number, PushOptions())
         if number == first:
             assert all(ask(served, 0, "reset", name, kwargs=kwargs).error is None for name in names)
-    alive = served.engines[1].models.own_weights._alive
+    alive = served.engines[1].model.own_weights._alive
     assert first not in alive
     if stops:
         held, other = served.migrators[0].sessions, _Peer(served, 1)
@@ -349,10 +349,7 @@ class Guarded(Agent):
 def test_no_method_of_a_policy_runs_without_its_lock(monkeypatch: pytest.MonkeyPatch) -> None:
     served = Replicas([Guarded(), Guarded()], batch_sizes=(4,), max_batch_size=4)
     try:
-        models = [
-            model for engine in served.engines for model in engine.models._cache.loaded.values()
-        ]
-        assert len(models) == 2
+        models = [engine.model.require_loaded() for engine in served.engines]
         monkeypatch.setattr(
             Guarded, "held", staticmethod(lambda: any(model.busy.locked() for model in models))
         )

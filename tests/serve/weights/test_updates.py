@@ -211,7 +211,7 @@ def test_a_learner_that_dies_between_the_phases_leaves_the_last_version(
     served = Served(serving(Gain()))
     monkeypatch.setattr(versions, "STAGED_S", 0.0)
     dropped = threading.Event()
-    own = served.engine.models.own_weights
+    own = served.engine.model.own_weights
     drop = own.drop
     monkeypatch.setattr(own, "drop", lambda number: (drop(number), dropped.set()))
     served.learn.stage(1, gains(1), PushOptions())
@@ -327,7 +327,7 @@ def test_versions_that_nobody_acts_with_are_freed(serving: Callable[..., Engine]
     served.reset("a")
     for number in range(1, 4):
         served.push(number)
-    assert sorted(served.engine.models.own_weights._alive) == [0, 3]
+    assert sorted(served.engine.model.own_weights._alive) == [0, 3]
 
 
 def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(

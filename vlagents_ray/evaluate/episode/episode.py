@@ -21,11 +21,11 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import ERROR, BatchEnv, Environment
 from vlagents_ray.errors import (
-    CheckpointFailed,
     ConfigError,
     EnvFailed,
     InvalidAction,
     PolicyFailed,
+    PolicyUnavailable,
     VLAgentsError,
 )
 from vlagents_ray.evaluate.episode import failures
@@ -198,6 +198,7 @@ def run_episodes(
     clock: ClockConfig | None = None,
     reset_options: Mapping[str, Any] | None = None,
     policy_options: Mapping[str, Any] | None = None,
+    checkpoint: str | None = None,
     observers: Sequence[EpisodeObserver] = (),
     watch: Watch = lambda _phase, _steps: None,
     images: Images = "all",
@@ -218,6 +219,8 @@ def run_episodes(
             `latency`); None: the environments wait for the policy.
         reset_options: The options of each reset of an environment.
         policy_options: The options of each reset of the policy.
+        checkpoint: The name of the checkpoint with which the policy must begin each episode; None
+            for any.
         observers: The observer of each episode; may be empty.
         watch: Called before each phase that may take a long time.
         images: The observations whose images are used; the environments may leave out all other
@@ -272,7 +275,7 @@ def run_episodes(
         episodes.append(_Episode(len(episodes), session, stats, observer, new_executor, obs))
 
     watch("policy reset", 0)
-    _reset_policy(agent, episodes, contract, policy_options or {})
+    _reset_policy(agent, episodes, contract, policy_options or {}, checkpoint)
 
     # Run until all episodes are finished.
     steps = 0
@@ -298,7 +301,7 @@ def run_episodes(
             instructed = _instructed(env, playing)
             if instructed:
                 watch("policy reset", steps)
-                _reset_policy(agent, instructed, contract, policy_options or {})
+                _reset_policy(agent, instructed, contract, policy_options or {}, checkpoint)
                 playing = _unfinished(playing)
 
     return [episode.outcome for episode in episodes if episode.outcome is not None]
@@ -327,13 +330,21 @@ class _Episode:
     def __post_init__(self) -> None:
         self._executor = self.new_executor()
 
-    def began(self, answer: dict[str, Any] | Exception) -> None:
-        """Begin the episode, with the policy's answer to the reset of the session."""
+    def began(self, answer: dict[str, Any] | Exception, checkpoint: str | None) -> None:
+        """Begin the episode, with the policy's answer to the reset of the session, unless the
+        policy has another checkpoint than `checkpoint`.
+        """
         try:
             with failures.policy_side("reset"):
                 if isinstance(answer, Exception):
                     raise answer
                 self.stats.began(answer)
+            if checkpoint is not None and self.stats.checkpoint != checkpoint:
+                # The server may be loading the checkpoint, so the episode is repeated.
+                raise PolicyUnavailable(
+                    f"reset: expected an episode with the checkpoint {checkpoint!r}, got one with "
+                    f"{self.stats.checkpoint!r}; let only this evaluation change the server"
+                )
         except VLAgentsError as error:
             self.failed(error)
 
@@ -420,7 +431,7 @@ class _Episode:
 
     def failed(self, error: VLAgentsError) -> None:
         """End the episode with an error; an error of the policy is recorded as a result."""
-        if isinstance(error, PolicyFailed) and not isinstance(error, CheckpointFailed):
+        if isinstance(error, PolicyFailed):
             self.outcome = self.stats.result(transport_of(self.session), error)
         else:
             self.outcome = error
@@ -440,7 +451,11 @@ def _instructed(env: BatchEnv, playing: Sequence[_Episode]) -> list[_Episode]:
 
 
 def _reset_policy(
-    agent: Agent, episodes: Sequence[_Episode], contract: Contract, options: Mapping[str, Any]
+    agent: Agent,
+    episodes: Sequence[_Episode],
+    contract: Contract,
+    options: Mapping[str, Any],
+    checkpoint: str | None,
 ) -> None:
     """Reset the session of each episode with its observation, in one message to a server."""
     keys = [episode.stats.key for episode in episodes]
@@ -474,7 +489,7 @@ def _reset_policy(
                 answers.append(error)
 
     for episode, answer in zip(episodes, answers, strict=True):
-        episode.began(answer)
+        episode.began(answer, checkpoint)
 
 
 def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contract) -> None:

@@ -50,7 +50,6 @@ _USER = (
     errors.NotOffered,
     errors.PolicyFailed,
     errors.UnknownApp,
-    errors.UnknownCheckpoint,
 )
 # Errors of the simulator; an `InvalidInput` reports an unusable observation of the environment.
 _WORKER = (errors.EnvFailed, errors.InvalidInput)

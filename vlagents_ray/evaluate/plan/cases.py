@@ -21,6 +21,11 @@ from vlagents_ray.evaluate.plan.config import (
     fingerprint,
 )
 from vlagents_ray.naming import plain
+from vlagents_ray.policies.base.checkpoint import (
+    CHECKPOINT,
+    CHECKPOINT_STEP,
+    checkpoint_name,
+)
 from vlagents_ray.policies.base.program import Program, code_of_class, files_named, with_defaults
 from vlagents_ray.registry import env_class, env_suite, env_task
 
@@ -54,33 +59,50 @@ class EvalCase:
         return self.policy_id, self.suite.name, self.env
 
     @property
-    def policy_options(self) -> dict[str, Any]:
-        """The options of each reset of the policy."""
-        return self.policy.options | ({"checkpoint_step": self.step} if self.policy.steps else {})
+    def checkpoint_step(self) -> int | None:
+        """The training step with which the policy is loaded; None unless this is a sweep over
+        checkpoints.
+        """
+        return self.step if self.policy.steps else None
+
+    @property
+    def checkpoint(self) -> str | None:
+        """The name of the checkpoint with which the policy is loaded, which its server reports at
+        each reset; None unless this is a sweep over checkpoints.
+        """
+        if self.checkpoint_step is None:
+            return None
+        settings = {CHECKPOINT: self.policy.checkpoint, CHECKPOINT_STEP: self.checkpoint_step}
+        return checkpoint_name(settings)
 
     @property
     def settings(self) -> dict[str, Any]:
         """All settings on which an episode depends, apart from its number and seed."""
         pushed = self.policy.pushed_weights
+        swept = {} if self.checkpoint_step is None else {CHECKPOINT_STEP: self.checkpoint_step}
         robot = {}
         if self.robot is not None:
             config, task = self.on_robot
             settings = config.model_dump(exclude={"tasks", "key", "ignore_mismatch"})
             robot = {"robot": settings | {"task": task.model_dump()}}
-        return robot | {
-            "pushed_weights": None if pushed is None else pushed.model_dump(),
-            "env": self.env,
-            "env_options": self.suite.env_options,
-            "reset_options": self.suite.reset_options,
-            "policy": self.policy.name,
-            "policy_config": self.policy.config,
-            "policy_options": self.policy_options,
-            "checkpoint": self.policy.checkpoint,
-            "execute": self.policy.execute,
-            "codec": "jpeg" if self.policy.codec == "jpeg" else "exact",
-            "num_envs": self.suite.num_envs,
-            "clock": self.suite.clock.model_dump() if self.suite.clock else None,
-        }
+        return (
+            robot
+            | swept
+            | {
+                "pushed_weights": None if pushed is None else pushed.model_dump(),
+                "env": self.env,
+                "env_options": self.suite.env_options,
+                "reset_options": self.suite.reset_options,
+                "policy": self.policy.name,
+                "policy_config": self.policy.config,
+                "policy_options": self.policy.options,
+                "checkpoint": self.policy.checkpoint,
+                "execute": self.policy.execute,
+                "codec": "jpeg" if self.policy.codec == "jpeg" else "exact",
+                "num_envs": self.suite.num_envs,
+                "clock": self.suite.clock.model_dump() if self.suite.clock else None,
+            }
+        )
 
     @cached_property
     def fingerprint(self) -> str:

@@ -113,7 +113,8 @@ class PolicyConfig(_PlanModel):
         default=[],
         max_length=MOST_STEPS_NAMED,
         description="Checkpoints to compare: a list of training steps, or `{first, last, every}`. "
-        "Each is chosen with the reset option `checkpoint_step`.",
+        "Each is loaded with the setting `checkpoint_step`, in place of the one before it, once "
+        "the episodes of that one are done. Only for a `source`.",
     )
     pushed_weights: PushedWeights | None = Field(
         default=None,
@@ -167,10 +168,7 @@ class PolicyConfig(_PlanModel):
                 "checkpoints in the results"
             )
 
-        reserved = {"seed", "env", "contract"}
-        if self.steps:
-            reserved.add("checkpoint_step")
-        conflicts = sorted(reserved & self.options.keys())
+        conflicts = sorted({"seed", "env", "contract"} & self.options.keys())
         if conflicts:
             raise ValueError(
                 f"options: expected no options that the evaluation sets for each episode, got "

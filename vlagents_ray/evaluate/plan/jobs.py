@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
@@ -58,7 +59,7 @@ def plan_jobs(cases: Iterable[EvalCase]) -> list[Job]:
 class JobQueue:
     """A queue of waiting jobs by environment, so that a worker can keep its environment."""
 
-    def __init__(self, jobs: Iterable[Job]) -> None:
+    def __init__(self, jobs: Iterable[Job] = ()) -> None:
         self._waiting: dict[str, deque[Job]] = {}  # waiting jobs by place
         self._kinds: dict[str, str] = {}  # place -> kind
         for job in jobs:
@@ -117,6 +118,11 @@ class JobQueue:
         kind = max(short, key=batches_per_worker)
         place = self._places_of(kind)[0]
         return self._waiting[place][0].case
+
+    def has_jobs_of(self, policy: str) -> bool:
+        """Return whether a job of this policy waits."""
+        waiting = itertools.chain.from_iterable(self._waiting.values())
+        return any(job.case.policy.name == policy for job in waiting)
 
     def drop(self, settings: str) -> int:
         """Remove the waiting jobs of the case with this fingerprint, and return their number."""

@@ -37,6 +37,7 @@ OF_POLICY = frozenset(
         "policy_config",
         "policy_options",
         "checkpoint",
+        "checkpoint_step",
         "pushed_weights",
         "execute",
         "codec",

@@ -329,7 +329,7 @@ def evaluate_on_robot(
         config: The policies, with their URLs, and the plan, with `robot`.
         operator: The operator at the robot.
         robot: The robot; by default an object of the class `config.robot.arm`.
-        agent_factory: Called with a policy to create the agent for a trial; by default, the agent
+        agent_factory: Called with a case to create the agent for a trial; by default, the agent
             is a connection to the policy's `url`.
 
     Returns:
@@ -360,7 +360,7 @@ def play_trials(
         plan: The plan, whose configuration passes `require_trials`.
         operator: The operator at the robot.
         robot: The robot; by default an object of the class `config.robot.arm`.
-        agent_factory: Called with a policy to create the agent for a trial; by default, the agent
+        agent_factory: Called with a case to create the agent for a trial; by default, the agent
             is a connection to the policy's `url`.
 
     Returns:
@@ -420,6 +420,13 @@ def require_trials(config: EvalConfig) -> None:
         raise ConfigError(
             "robot: expected `robot: {tasks: …}` in the plan and the robot's class (--robot), "
             "got no robot; give both"
+        )
+    swept = [policy.name for policy in config.policies if policy.steps]
+    if swept:
+        raise ConfigError(
+            f"steps: expected none with a robot, whose trials alternate between the policies, got "
+            f"some of {swept}; name each checkpoint as a policy, with `config: {{checkpoint_step: "
+            "N}}`"
         )
     if any(policy.pushed_weights is not None for policy in config.policies):
         raise ConfigError(

@@ -20,7 +20,6 @@ from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import Command, CommandInbox
 from vlagents_ray.errors import (
-    CheckpointFailed,
     EnvFailed,
     InvalidAction,
     PolicyFailed,
@@ -252,7 +251,6 @@ def play(
         The ended trial; its status is "policy_error" if the policy failed.
 
     Raises:
-        CheckpointFailed: The policy cannot load its checkpoint.
         EnvFailed: The robot failed.
         PolicyUnavailable: The policy's server was silent or could not be reached.
     """
@@ -287,7 +285,7 @@ def play(
                 # The rehearsal has already compared the numbers with the training data; in a trial,
                 # the policy's behaviour must become the result.
                 fit=fit_of(player, robot, trained=Trained()),
-                reset_options={**case.policy_options, "env": case.env, "seed": trial.job.key.seed},
+                reset_options={**case.policy.options, "env": case.env, "seed": trial.job.key.seed},
                 report=report,
             )
             run_loop(
@@ -301,8 +299,6 @@ def play(
                 recorder=recorder,
                 options=options,
             )
-        except CheckpointFailed:
-            raise
         except PolicyFailed as error:
             failed = error
 
@@ -357,12 +353,12 @@ def rehearse(
 
         if fit.trained.action is not None:
             with contextlib.suppress(InvalidAction):
-                agent.reset(obs, task.instruction, **case.policy_options)
+                agent.reset(obs, task.instruction, **case.policy.options)
                 fit.require(None, agent.act(obs).rows())
 
         # In a trial, this error counts as the policy's failure.
         with contextlib.suppress(InvalidAction):
-            player.reset(obs, task.instruction, **case.policy_options)
+            player.reset(obs, task.instruction, **case.policy.options)
             player.act(obs)
 
 
@@ -378,7 +374,7 @@ def _player(
     settings, and closes both.
     """
     settings, _ = case.on_robot
-    agent = factory(case.policy)
+    agent = factory(case)
     with contextlib.ExitStack() as unplayed:
         unplayed.callback(agent.close)
         agent.initialize()

@@ -57,7 +57,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
         Args:
             plan: The plan of the jobs.
-            agent_factory: Creates a worker's agent for a policy.
+            agent_factory: Creates a worker's agent for a case.
             recorders: Creates the recorder of an episode; None: recorders of the plan's videos and
                 trajectories.
         """
@@ -78,6 +78,10 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         jobs, which may still be starting.
         """
         return Counter(worker.kind for worker in self._workers if occupied or not worker.jobs)
+
+    def busy_policies(self) -> set[str]:
+        """Return the policies with whose agents workers run episodes."""
+        return {worker.jobs[0].case.policy.name for worker in self._workers if worker.jobs}
 
     def busy_places(self) -> Counter[str]:
         """Return the number of busy workers at each place."""

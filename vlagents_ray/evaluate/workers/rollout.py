@@ -40,11 +40,11 @@ from vlagents_ray.evaluate.episode.failures import (
 )
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
-from vlagents_ray.evaluate.plan.config import PolicyConfig
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, TimeLimits
 from vlagents_ray.interface import Agent
-from vlagents_ray.policies.base.checkpoint import used_checkpoints
+from vlagents_ray.policies.base.accelerator import free_memory
+from vlagents_ray.policies.base.checkpoint import CHECKPOINT_STEP, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import identify_weights
 from vlagents_ray.policies.base.program import Program, code_of_class, files_named, loaded_code
 from vlagents_ray.protocol.json_messages import plain_values
@@ -54,8 +54,9 @@ from vlagents_ray.registry import env_class
 
 log = logging.getLogger(__name__)
 
-AgentFactory = Callable[[PolicyConfig], Agent]
-OwnAgents = Callable[[], Agent] | Mapping[str, Callable[[], Agent]] | None
+AgentFactory = Callable[[EvalCase], Agent]  # creates the agent of a case's policy
+# Functions that create agents. That of a policy with `steps` is called with `checkpoint_step`.
+OwnAgents = Callable[..., Agent] | Mapping[str, Callable[..., Agent]] | None
 # Thread settings that are set before any import in a worker, since several workers share a machine.
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -100,7 +101,8 @@ class Rollout:
         self._agent_factory = agent_factory
         self._recorders = recorders
         self._agent: Agent | None = None
-        self._policy: str | None = None  # the policy of the agent
+        # The policy of the agent, and its training step in a sweep over checkpoints.
+        self._policy: tuple[str, int | None] | None = None
         # Metadata of an agent without a server: its weights.
         self._local_metadata: dict[str, Any] = {}
         self._broken_agents = 0  # number of consecutive broken agents
@@ -164,8 +166,8 @@ class Rollout:
         added to `new_fields`, even if an error is raised later.
         """
         case = jobs[0].case
-        if self._agent is None or self._policy != case.policy.name:
-            self._agent = self._connect(case.policy)
+        if self._agent is None or self._policy != (case.policy.name, case.checkpoint_step):
+            self._agent = self._connect(case)
             new_fields["policy"] = self._local_metadata or _metadata(self._agent)
         if self._env is None or self._env_place != case.place:
             self._env = self._make_env(case)
@@ -208,7 +210,9 @@ class Rollout:
                 execute=case.policy.execute,
                 clock=case.suite.clock,
                 reset_options=case.suite.reset_options,
-                policy_options=case.policy_options,
+                policy_options=case.policy.options,
+                # An agent without metadata need not name its checkpoint.
+                checkpoint=case.checkpoint if hasattr(agent, "metadata") else None,
                 observers=recordings,
                 watch=self._set_phase,
                 images="all" if recordings[0].needs_images else "requested",
@@ -244,15 +248,19 @@ class Rollout:
     def _set_phase(self, phase: episode.Phase, steps: int) -> None:
         self._current_phase = (phase, monotonic(), steps)
 
-    def _connect(self, policy: PolicyConfig) -> Agent:
-        """Return a new agent for the policy, and close the present agent."""
+    def _connect(self, case: EvalCase) -> Agent:
+        """Return a new agent for the policy of a case, and close the present agent, so that this
+        process never has two checkpoints in memory.
+        """
         self._set_phase("connect", 0)
-        self._drop_agent()
+        if self._agent is not None:
+            self._drop_agent()
+            free_memory()
         if self._broken_agents:  # the server may be restarting or full
             sleep(min(FIRST_WAIT_S * 2 ** (self._broken_agents - 1), LONGEST_WAIT_S))
 
         with policy_side("start"):
-            agent = self._agent_factory(policy)
+            agent = self._agent_factory(case)
         try:
             with policy_side("initialize"), used_checkpoints() as checkpoints:
                 agent.initialize()
@@ -265,7 +273,7 @@ class Rollout:
         weights = identify_weights(agent, checkpoints)
         is_local = not hasattr(agent, "metadata")
         self._local_metadata = {"weights": weights} if weights and is_local else {}
-        self._policy = policy.name
+        self._policy = (case.policy.name, case.checkpoint_step)
         return agent
 
     def _make_env(self, case: EvalCase) -> BatchEnv:
@@ -329,7 +337,7 @@ def own_logs() -> list[str]:
 def agents(
     plan: ResolvedPlan, own: OwnAgents = None, priority: PriorityName = "simulation"
 ) -> AgentFactory:
-    """Return the function with which a worker creates an agent for a policy.
+    """Return the function with which a worker creates an agent for a case.
 
     Args:
         plan: The policies, and the time limits of a connection.
@@ -341,7 +349,7 @@ def agents(
         ConfigError: A policy has neither a URL nor a factory in `own`.
     """
     if callable(own):
-        return lambda _policy: own()
+        return functools.partial(_own_agent, own)
 
     factories = own or {}
     for policy in plan.policies:
@@ -353,14 +361,20 @@ def agents(
     return functools.partial(_agent, plan.limits, factories, priority)
 
 
+def _own_agent(make: Callable[..., Agent], case: EvalCase) -> Agent:
+    step = case.checkpoint_step
+    return make() if step is None else make(**{CHECKPOINT_STEP: step})
+
+
 def _agent(
     limits: TimeLimits,
-    factories: Mapping[str, Callable[[], Agent]],
+    factories: Mapping[str, Callable[..., Agent]],
     priority: PriorityName,
-    policy: PolicyConfig,
+    case: EvalCase,
 ) -> Agent:
+    policy = case.policy
     if policy.name in factories:
-        return factories[policy.name]()
+        return _own_agent(factories[policy.name], case)
     return RemoteAgent(
         str(policy.url),  # `agents` has checked that there is a URL
         transport=policy.transport,
@@ -383,7 +397,7 @@ def factory_programs(plan: ResolvedPlan, own: OwnAgents) -> dict[str, Program]:
     return {name: factory_program(make) for name, make in (own or {}).items()}
 
 
-def factory_program(make: Callable[[], Agent]) -> Program:
+def factory_program(make: Callable[..., Agent]) -> Program:
     """Return the files of the module that defines `make`, and the files that the arguments of a
     `partial` name.
     """

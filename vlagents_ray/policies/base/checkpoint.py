@@ -17,6 +17,8 @@ from vlagents_ray.registry import require
 log = logging.getLogger(__name__)
 
 STEP = "{step}"  # the placeholder in a checkpoint's name
+# The settings of a policy that select its weights.
+CHECKPOINT, CHECKPOINT_STEP = "checkpoint", "checkpoint_step"
 _INDEX = ".safetensors.index.json"
 # Number of compared elements of each tensor, enough to distinguish trained weights from random
 # ones.
@@ -27,6 +29,24 @@ _LISTED = 8
 def at_step(name: str, step: int | str | None) -> str:
     """Return the name of a checkpoint with its step filled in, if the name has a placeholder."""
     return name if step is None else name.replace(STEP, str(step))
+
+
+def resolved(settings: Mapping[str, Any]) -> str | None:
+    """Return the checkpoint in a policy's settings, with its step filled in."""
+    checkpoint = settings.get(CHECKPOINT)
+    if not isinstance(checkpoint, str):
+        return checkpoint
+    return at_step(checkpoint, settings.get(CHECKPOINT_STEP))
+
+
+def checkpoint_name(settings: Mapping[str, Any]) -> str | None:
+    """Return a name for the weights that a policy's settings select, which differs for each step:
+    the checkpoint with its step. None if the settings contain neither.
+    """
+    checkpoint, step = settings.get(CHECKPOINT), settings.get(CHECKPOINT_STEP)
+    if step is None or (isinstance(checkpoint, str) and STEP in checkpoint):
+        return resolved(settings)
+    return f"step {step}" if checkpoint is None else f"{checkpoint} at step {step}"
 
 
 _used: ContextVar[list[Path] | None] = ContextVar("_used", default=None)

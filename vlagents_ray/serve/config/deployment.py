@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Annotated, Any, Literal
 
@@ -11,7 +10,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from vlagents_ray.bounds import MOST_BYTES, MOST_CPUS, MOST_ROWS, MOST_S, MOST_WORKERS
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.program import Program, loaded_code
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.ray_tools.git_state import GitState, code_of
@@ -20,7 +18,6 @@ from vlagents_ray.registry import target_of
 from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.config.parts import PartArgs
-from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.slo import MOST, SHARE, Slo
 
@@ -122,39 +119,6 @@ class BatchArgs(_DeploymentModel):
             )
         self.max_size = self.sizes[-1]
         return self
-
-
-class CheckpointArgs(_DeploymentModel):
-    """The checkpoints that a session may choose, as in `reset(..., checkpoint="late")` or
-    `checkpoint_step=20000`.
-    """
-
-    choices: dict[str, dict[str, Any]] = Field(
-        default_factory=dict,
-        description="Checkpoints by name: settings that replace those in `config`.",
-    )
-    steps: bool = Field(
-        default=False,
-        description="Sessions may choose any training step of a checkpoint whose path contains "
-        "`{step}`.",
-    )
-    loaded: int = Field(
-        default=2,
-        ge=1,
-        le=1_000_000,
-        description="Largest number of checkpoints in the memory of one replica.",
-    )
-
-    def of(
-        self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]
-    ) -> Checkpoints:
-        """Return the checkpoints of a policy.
-
-        Args:
-            make: Creates an agent from settings.
-            config: The deployment's own settings of the policy.
-        """
-        return Checkpoints(make, config, self.choices, steps=self.steps, loaded=self.loaded)
 
 
 class SessionArgs(_DeploymentModel):
@@ -271,7 +235,7 @@ class LimitArgs(_DeploymentModel):
         default=CallLimits().load_s,
         gt=0,
         le=MOST_S,
-        description="Time limit for loading a checkpoint, in seconds.",
+        description="Time limit for loading the policy, in seconds.",
     )
     body_bytes: int = Field(
         default=DEFAULT_LIMITS.body_bytes,
@@ -531,10 +495,6 @@ class ServerArgs(_DeploymentModel):
         default=[],
         description="Wrappers of the policy, beginning with the wrapper that is nearest to the "
         "robot: names, or `{name: settings}`.",
-    )
-    checkpoints: CheckpointArgs = Field(
-        default=CheckpointArgs(),
-        description="Checkpoints from which sessions choose.",
     )
     replicas: int | None = Field(
         default=None,

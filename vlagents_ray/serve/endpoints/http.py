@@ -111,7 +111,7 @@ class _HttpEndpoint:
         if ready:
             return PlainTextResponse("OK\n")
 
-        step = self.engine.models.step
+        step = self.engine.model.step
         suffix = f" ({step})" if step else ""
         loading = f"the policy is loading{suffix}"
         unready = PolicyUnavailable(f"{loading}, or did not load; GET /v1/metadata says which")

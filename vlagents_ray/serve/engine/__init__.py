@@ -20,10 +20,6 @@ PendingRequest.reserved, .sought
     writers: the thread that reserves for the request
     protection: only one thread at a time reserves for, searches for or queues a request
 
-PendingRequest.loaded
-    writers: checkpoints, before it queues the reset again
-    protection: lock of the queue, through which the policy gets the request
-
 Origin.sessions: episodes
     writers: each thread that reserves or undoes a reset, policy at a close
     protection: lock of SessionTable; an act sets an episode only if there is none
@@ -32,7 +28,7 @@ Origin.ended
     writers: the thread that ends the connection
     protection: is only ever set
 
-Session.agent, .prepares, .steps, .instruction, .resetting, .announced
+Session.agent, .prepares, .model, .steps, .instruction, .announced
     writers: policy; before the session is in the table, the thread that creates it
     protection: one writer
 
@@ -44,20 +40,24 @@ Session.first, .expected, .began, .last_reset, .moves, .over
     writers: each thread that reserves, runs or undoes a reset
     protection: lock of SessionTable
 
-LoadedModel.deferred
-    writers: checkpoints
-    protection: one writer
-
 Session.origin, .used, .moved_in
     writers: each thread that reserves for a request of the session
     protection: the last value counts: requests of two threads have no order
 
-Session.model, LoadedModel.sessions
-    writers: policy, checkpoints, each thread that ends a session
-    protection: lock of ModelCache; a reader copies the reference
+ServedModel: model, settings
+    writers: policy; the thread that closes the engine, after the policy's thread has ended
+    protection: one writer; a reader copies the reference
+
+LoadedModel.closed
+    writers: as ServedModel
+    protection: LoadedModel.busy
+
+Runner: next swap
+    writers: the thread that swaps, policy
+    protection: one swap at a time; the policy takes it between two batches
 
 Session.weights, .follows
-    writers: policy at a reset, the push that commits a version
+    writers: policy at a reset and a swap, the push that commits a version
     protection: lock of the ModelWeights of the session's model
 
 ModelWeights: versions

@@ -16,7 +16,7 @@ from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.ability_call import AbilityCall
 from vlagents_ray.serve.engine.parts import EngineParts
 from vlagents_ray.serve.engine.responses import public_error, require_serializable
-from vlagents_ray.serve.requests import DEFAULT, PendingRequest
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights.safetensors import read_values, write_values
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
@@ -26,7 +26,7 @@ class BackgroundCalls:
     """Executes background calls, one after the other, on a separate thread. Thread-safe."""
 
     def __init__(self, parts: EngineParts) -> None:
-        self._models = parts.models
+        self._model = parts.model
         self._weights = parts.weights
         self._reply_bytes = parts.settings.reply_bytes
         self._thread = ThreadPoolExecutor(1, "policy-background")  # started by the first call
@@ -66,12 +66,10 @@ class BackgroundCalls:
 
     def _use_ability(self, call: AbilityCall) -> dict[str, Any]:
         """Return whether the loaded policy has an ability, or the result of a call."""
-        model = self._models.loaded(DEFAULT)
-        if model is None:
-            raise self._models.loading()
+        agent = self._model.require_loaded().agent
         if not call.member:
-            return {"available": call.is_available(model.agent)}
-        return {"result": call.execute(model.agent, None)}
+            return {"available": call.is_available(agent)}
+        return {"result": call.execute(agent, None)}
 
     def _make_weights(
         self,

@@ -2,17 +2,19 @@
 
 Every endpoint (HTTP, WebSocket, a Serve handle, …) decodes a message, and its `Sender` submits the
 requests to the `Intake`, which queues them. The `Runner` takes batches from the queue on the
-policy's thread, and delivers the answers. The `ModelManager` loads checkpoints.
+policy's thread, and delivers the answers. The `ServedModel` loads the policy, and replaces it.
 """
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from typing import Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import OutcomeUnknown
+from vlagents_ray.errors import OutcomeUnknown, PolicyUnavailable
 from vlagents_ray.interface import Agent
 from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.engine.admission import Admission
@@ -26,9 +28,8 @@ from vlagents_ray.serve.engine.parts import EngineParts
 from vlagents_ray.serve.engine.pauses import PauseDetector
 from vlagents_ray.serve.engine.runner import Runner
 from vlagents_ray.serve.engine.settings import EngineSettings
-from vlagents_ray.serve.models.checkpoints import Checkpoints
-from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader
-from vlagents_ray.serve.models.model_manager import ModelCache, ModelManager
+from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader, PolicySource
+from vlagents_ray.serve.models.served_model import ServedModel
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.call_limits import PolicyCalls
@@ -41,17 +42,16 @@ _DEFAULT = EngineSettings()
 
 
 class Engine:
-    """Serves an agent, or agents of several checkpoints, to many sessions, from `start`, which
-    loads the policy, to `close`.
+    """Serves a policy to many sessions, from `start`, which loads the policy, to `close`.
 
-    `intake` checks and queues requests, `runner` runs the batches, and `models` loads checkpoints.
-    `health` contains the reason if the policy cannot act, and `moves` moves sessions between
-    replicas.
+    `intake` checks and queues requests, `runner` runs the batches, and `model` is the loaded
+    policy. `health` contains the reason if the policy cannot act, and `moves` moves sessions
+    between replicas.
     """
 
     def __init__(
         self,
-        agent: Agent | Checkpoints,
+        policy: Agent | PolicySource,
         settings: EngineSettings = _DEFAULT,
         *,
         finder: SessionFinder | None = None,
@@ -63,7 +63,8 @@ class Engine:
         """Create the engine, without loading the policy.
 
         Args:
-            agent: The agent, or the checkpoints among which sessions can choose.
+            policy: The agent, or the settings of the policy and the function that creates its
+                agents, with which `swap` can load other settings.
             settings: The settings.
             finder: Fetches sessions from other replicas.
             on_step: Called with each step of a long load, on the thread that loads.
@@ -71,19 +72,18 @@ class Engine:
             wall_clock: Wall clock, ns.
             poller: Poller of the queue; that of a simulated engine does not block.
         """
-        source = agent if isinstance(agent, Checkpoints) else Checkpoints(lambda _: agent)
+        source = policy if isinstance(policy, PolicySource) else PolicySource(lambda _: policy)
         self.settings, self.clock, self.finder = settings, clock, finder
         self.stats = MetricsBuffer()
         self.observers = Observers()
         self.calls, self.pauses = PolicyCalls(settings.limits, clock), PauseDetector(clock)
         self.drain_list = DrainList()
 
-        cache = ModelCache(source)
         self.sessions: SessionTable[LoadedModel] = SessionTable(
-            settings.session_limit, settings.session_idle_s, wall_clock, cache
+            settings.session_limit, settings.session_idle_s, wall_clock
         )
         loader = Loader(
-            source,
+            source.make,
             settings.version,
             settings.batch_sizes,
             settings.max_batch_size,
@@ -91,9 +91,10 @@ class Engine:
             self.calls,
             self.stats,
         )
-        self.models = ModelManager(source, loader, cache, self.sessions, on_step, self._quiet_s)
-        self.weights = WeightUpdates(self.models, self.sessions)
-        self.health = Health(self.models, self.calls, self.stats)
+        self.model = ServedModel(source.config, loader, self.sessions, on_step)
+        self._swapping = threading.Lock()  # held during a swap
+        self.weights = WeightUpdates(self.model, self.sessions)
+        self.health = Health(self.model, self.calls, self.stats)
         self.queue = BatchQueue(
             settings.max_batch_size,
             sessions=self.sessions,
@@ -115,9 +116,8 @@ class Engine:
         parts = EngineParts(
             settings=settings,
             clock=clock,
-            source=source,
             sessions=self.sessions,
-            models=self.models,
+            model=self.model,
             weights=self.weights,
             queue=self.queue,
             pace=self.pace,
@@ -130,12 +130,17 @@ class Engine:
         self.intake, self.moves = Intake(parts, self._background), SessionMoves(parts)
         self.runner = Runner(parts, self.intake, self.moves)
 
-    def start(self) -> None:
+    def start(self, config: Mapping[str, Any] | None = None) -> None:
         """Load the policy on its thread, and return when it can act.
+
+        Args:
+            config: The settings of the policy, in place of those in its `PolicySource`.
 
         Raises:
             PolicyFailed: The policy does not load, or not within the time limit.
         """
+        if config is not None:
+            self.model.config = dict(config)
         try:
             self.runner.start()
         except Exception as error:
@@ -145,26 +150,43 @@ class Engine:
             each_half_second.add(self.queue.lend_poller)
         self.health.finish_loading()
 
+    def swap(self, config: Mapping[str, Any]) -> None:
+        """Load the policy with other settings in place of the loaded one, and return when it can
+        act. All sessions end. Until the policy can act, requests are rejected with
+        `PolicyUnavailable`, and after a failed attempt with `PolicyFailed`, which the next call may
+        correct.
+
+        The method does nothing if the policy acts with these settings already. The policy's thread
+        must not call it, unless the engine has no threads.
+
+        Raises:
+            PolicyFailed: The policy does not load, or not within the time limit.
+        """
+        with self._swapping:
+            if self.model.loaded is not None and dict(config) == self.model.config:
+                return
+            with suppress(PolicyUnavailable):  # no policy is loaded, or it does not wake
+                self.weights.rest(Rest("wake"))
+            self.health.begin_loading()
+            try:
+                self.runner.swap(config)
+            except Exception as error:
+                raise self.health.fail_loading(error) from error
+            self.health.finish_loading()
+
     def collect_stats(self) -> Collected:
         """Return the metrics recorded since the last call, including the processes of policies that
         run in another Python environment.
         """
-        for work in self.models.gpu_work_elsewhere():
+        work = self.model.gpu_work_elsewhere()
+        if work is not None:
             self.stats.add_gpu_work(work)
         return self.stats.collect()
 
-    def _quiet_s(self) -> float:
-        """Return the time since a model last computed actions, s; 0 while a model computes, or
-        while the policy sleeps.
-        """
-        return 0.0 if self.weights.acting_lock.locked() else self.queue.quiet_s()
-
     @property
     def contract(self) -> Contract | None:
-        """Contract of the deployment's own checkpoint; None if the checkpoint is not loaded yet or
-        has no contract.
-        """
-        return self.models.contract
+        """Contract of the loaded policy; None if no policy is loaded, or if it has no contract."""
+        return self.model.contract
 
     @property
     def draining(self) -> bool:
@@ -190,14 +212,14 @@ class Engine:
             self.intake.fail(pending, hanging.refusal)
 
     def close(self) -> None:
-        """Answer waiting requests with 503, finish the running batch, and close the agents."""
+        """Answer waiting requests with 503, finish the running batch, and close the agent."""
         self.pauses.stop()
         each_half_second.remove(self.queue.lend_poller)
         self.admission.close()
         self.stop(timeout_s=30)
         self.intake.close()
         self._background.close()
-        self.models.close()
+        self.model.close()
 
     def stop(self, timeout_s: float) -> None:
         """Reject all requests except the requests in the running batch, and wait at most

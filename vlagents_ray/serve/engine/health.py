@@ -9,10 +9,14 @@ from typing import NamedTuple
 from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.responses import raised_at
-from vlagents_ray.serve.models.model_manager import ModelManager
+from vlagents_ray.serve.models.served_model import ServedModel
 from vlagents_ray.serve.queue.call_limits import PolicyCall, PolicyCalls
 
 logger = logging.getLogger(__name__)
+
+# The beginning of the reason why a policy did not load, by which the process that starts the server
+# finds it in Serve's messages.
+NOT_LOADED = "the policy did not load"
 
 
 class HangingCall(NamedTuple):
@@ -29,16 +33,17 @@ class Health:
     failed to load, the replica stops, a call hangs, the policy is loading, its thread has ended.
     """
 
-    def __init__(self, models: ModelManager, calls: PolicyCalls, stats: MetricsBuffer) -> None:
-        self._models = models
+    def __init__(self, model: ServedModel, calls: PolicyCalls, stats: MetricsBuffer) -> None:
+        self._model = model
         self._calls = calls
         self._stats = stats
 
-        self._loading_error = models.loading()
+        self._loading_error = model.loading()
         self._lock = threading.Lock()  # held while one of the following fields is set
         self._loading = True
-        # Reason why the policy did not load, for clients and for the operator.
-        self._load_failure: PolicyFailed | None = None
+        # Reason why the policy did not load, for clients, which may find another replica, and for
+        # the operator.
+        self._load_failure: PolicyUnavailable | None = None
         self._full_load_failure: PolicyFailed | None = None
         self._stopping: PolicyUnavailable | None = None
         self._hung: PolicyCall | None = None  # overdue call, which `find_hanging_call` has detected
@@ -59,6 +64,13 @@ class Health:
             self.alive = False
             self._update()
 
+    def begin_loading(self) -> None:
+        """Record that the policy is loaded again, which may follow a failed attempt."""
+        with self._lock:
+            self._loading = True
+            self._load_failure = self._full_load_failure = None
+            self._update()
+
     def finish_loading(self) -> None:
         """Record that the policy is loaded."""
         with self._lock:
@@ -67,9 +79,9 @@ class Health:
 
     def fail_loading(self, error: Exception) -> PolicyFailed:
         """Record that the policy did not load; return the full reason, for the operator."""
-        failed = f"the policy did not load: {type(error).__name__}"
+        failed = f"{NOT_LOADED}: {type(error).__name__}"
         with self._lock:
-            self._load_failure = PolicyFailed(f"{failed}; the server's log says why")
+            self._load_failure = PolicyUnavailable(f"{failed}; the server's log says why")
             self._full_load_failure = PolicyFailed(f"{failed}: {error}{raised_at(error)}")
             self._update()
             return self._full_load_failure
@@ -133,12 +145,12 @@ class Health:
         return True
 
     def require_ready(self) -> None:
-        """Raise `PolicyUnavailable` while the policy loads, `PolicyFailed` if it did not load or
-        its thread ended.
+        """Raise `PolicyUnavailable` while the policy loads, or if it did not load; raise
+        `PolicyFailed` if its thread ended.
         """
         unready = self._unready
         if unready is self._loading_error:
-            raise self._models.loading()  # with the current step of loading
+            raise self._model.loading()  # with the current step of loading
         if unready is not None:
             raise unready
         if self._calls.broken is not None:
@@ -158,4 +170,4 @@ class Health:
             raise PolicyUnavailable(overdue.describe())
         self.require_ready()
         self._calls.check_health()
-        self._models.check_health()
+        self._model.check_health()

@@ -70,8 +70,7 @@ class Intake:
         self._background = background
         self._health = parts.health
         self._sessions = parts.sessions
-        self._models = parts.models
-        self._source = parts.source
+        self._model = parts.model
         self._queue = parts.queue
         self._finder = parts.finder
         self._drain_list = parts.drain_list
@@ -114,7 +113,7 @@ class Intake:
         """Execute one of `IMMEDIATE_OPS`, and return the info of the reply."""
         request = pending.request
         if request.op == "gpu_memory":
-            return {"bytes": self._models.gpu_memory()}
+            return {"bytes": self._model.gpu_memory()}
         if request.op == "gpu_work":
             return asdict(self._stats.collect_gpu_work())
         self._store(pending.session_id, request)
@@ -223,15 +222,12 @@ class Intake:
     def _open(self, pending: PendingRequest) -> Opening:
         """Check a reset, and reserve an episode of its session."""
         request, origin, session_id = pending.request, pending.origin, pending.session_id
-        choice, kwargs = self._source.split_options(request.kwargs)
+        kwargs = dict(request.kwargs)
         slo = _stated_slo(kwargs.pop(SLO, None))
         if slo is None and pending.priority is Priority.ROBOT:
             slo = self._default_slo
         follows_newest = follows(kwargs, by_default=pending.priority is not Priority.ROBOT)
-        # If the checkpoint is not loaded yet, the request is checked after loading.
-        model = self._models.loaded(choice)
-        if model is not None:
-            model.check(request)
+        self._model.require_loaded().check(request)
 
         is_new = session_id not in self._sessions
         session = self._sessions.open(session_id, origin)
@@ -239,7 +235,7 @@ class Intake:
             # The client has had an episode at another replica, so it resumes a lost session.
             session.moved_in = self._clock()
         first, previous = self._sessions.begin(session, request.step, pending.arrived, origin)
-        return Opening(choice, kwargs, follows_newest, first, previous, slo)
+        return Opening(kwargs, follows_newest, first, previous, slo)
 
     def withdraw(self, *requests: PendingRequest) -> None:
         """End requests without an answer, as `BatchQueue.withdraw` does, and undo resets that

@@ -10,7 +10,7 @@ from vlagents_ray.errors import UnknownSession
 from vlagents_ray.serve.engine.parts import EngineParts
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.queue.replica_pace import RobotPlan
-from vlagents_ray.serve.requests import NOWHERE, CheckpointChoice, Origin
+from vlagents_ray.serve.requests import NOWHERE, Origin
 from vlagents_ray.serve.sessions import Session, SessionState
 
 
@@ -19,7 +19,7 @@ class SessionMoves:
 
     def __init__(self, parts: EngineParts) -> None:
         self._sessions = parts.sessions
-        self._models = parts.models
+        self._model = parts.model
         self._health = parts.health
         self._clock = parts.clock
 
@@ -42,34 +42,29 @@ class SessionMoves:
             moves=session.moves,
             age_s=asked - session.began,
             policy=list(model.version),
-            choice=[model.choice.name, model.choice.step],
-            settings=model.settings,
             weights=[weights.number, weights.fingerprint],
             follows=session.follows,
             instruction=session.instruction,
             robot=session.plan.to_list(),
         )
 
-    def adopt(self, session_id: str, state: SessionState, timeout_s: float = 0.0) -> None:
+    def adopt(self, session_id: str, state: SessionState) -> None:
         """Continue a session that another replica has released.
 
         Args:
             session_id: Id of the session.
             state: Its state at the other replica.
-            timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded
-                already.
 
         Raises:
-            UnknownSession: The session has, or had, a newer state here, has begun a reset, or needs
-                a checkpoint or a version of the policy that is not available here.
+            UnknownSession: The session has, or had, a newer state here, has begun a reset, or
+                belongs to another version of the policy.
         """
-        self.enter(self.prepare(session_id, state, timeout_s))
+        self.enter(self.prepare(session_id, state))
 
     def prepare(
         self,
         session_id: str,
         state: SessionState,
-        timeout_s: float = 0.0,
         began: float = 0.0,
         origin: Origin = NOWHERE,
         weights: Mapping[str, Any] | None = None,
@@ -100,9 +95,7 @@ class SessionMoves:
         )
         self._sessions.expect(arriving)
         try:
-            model = self._models.adopt(
-                arriving, CheckpointChoice(*state.choice), state.settings, timeout_s
-            )
+            model = arriving.model = self._model.require_loaded()
             if tuple(state.policy) != model.version:
                 raise UnknownSession(
                     f"session {session_id!r}: belongs to another version of the policy; reset it"
@@ -114,6 +107,7 @@ class SessionMoves:
                 arriving.weights = model.parameters.restore(number, fingerprint, weights)
             arriving.weights = model.parameters.find(number, fingerprint, follows=state.follows)
             with model.busy, model.uncaptured, model.call("adopt", threading.get_ident()):
+                model.require_open()
                 arriving.set_agent(model.copies.load(state.agent))
             arriving.follows, arriving.instruction = state.follows, state.instruction
         except BaseException:
@@ -129,6 +123,9 @@ class SessionMoves:
         except BaseException:
             self.abandon(arriving)
             raise
+        if model is not None and model.closed:  # the model was closed since `prepare`
+            self._sessions.close(arriving.id)
+            raise model.replaced()
         if model is not None:
             model.parameters.catch_up(arriving)
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from vlagents_ray.serve.engine.health import Health
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.settings import EngineSettings
-from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel
-from vlagents_ray.serve.models.model_manager import ModelManager
+from vlagents_ray.serve.models.served_model import ServedModel
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.replica_pace import ReplicaPace
 from vlagents_ray.serve.sessions import DrainList, SessionFinder, SessionTable
@@ -23,9 +22,8 @@ class EngineParts:
 
     settings: EngineSettings
     clock: Callable[[], float]  # s
-    source: Checkpoints
     sessions: SessionTable[LoadedModel]
-    models: ModelManager
+    model: ServedModel
     weights: WeightUpdates
     queue: BatchQueue
     pace: ReplicaPace

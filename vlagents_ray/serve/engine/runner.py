@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from vlagents_ray.abilities import Observes, ability
@@ -36,7 +36,6 @@ from vlagents_ray.serve.engine.responses import (
     timing,
 )
 from vlagents_ray.serve.models.loaded_model import LoadedModel
-from vlagents_ray.serve.models.model_manager import too_late
 from vlagents_ray.serve.queue.batch_queue import Taken
 from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.queue.replica_pace import RobotPlan, need_of
@@ -53,31 +52,18 @@ Acting = tuple[PendingRequest, Session[LoadedModel]]
 _WORKING = 0.5
 
 
-class WaitingReset:
-    """A reset that waits for its checkpoint."""
+@dataclass(frozen=True, slots=True)
+class Swap:
+    """The task to load the policy with other settings, in place of the loaded one."""
 
-    def __init__(
-        self, runner: Runner, pending: PendingRequest, session: Session[LoadedModel]
-    ) -> None:
-        self._runner = runner
-        self._pending = pending
-        self._session = session
-
-    def end(self, error: VLAgentsError | None) -> None:
-        """Queue the reset again, now that its session holds the model, or answer it
-        with the error.
-        """
-        self._runner.requeue(self._pending, error)
-
-    def is_abandoned(self) -> bool:
-        """Return whether the reset no longer needs to wait."""
-        return self._runner.is_abandoned(self._pending, self._session)
+    config: Mapping[str, Any]
+    done: Future[None] = field(default_factory=Future)
 
 
 class Runner:
     """Loads the policy, and runs its batches, on one thread: the policy's thread.
 
-    Only `start` and `join` may be called on another thread.
+    Only `start`, `swap` and `join` may be called on another thread.
     """
 
     def __init__(self, parts: EngineParts, intake: Intake, moves: SessionMoves) -> None:
@@ -85,7 +71,7 @@ class Runner:
         self._moves = moves
         self._health = parts.health
         self._sessions = parts.sessions
-        self._models = parts.models
+        self._model = parts.model
         self._weights = parts.weights
         self._queue = parts.queue
         self._pace = parts.pace
@@ -102,6 +88,7 @@ class Runner:
         self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
         # Future that is done when loading the policy has succeeded or failed.
         self._started: Future[None] = Future()
+        self._next_swap: Swap | None = None  # the swap that follows the running batch
         # Answers that another thread delivers while the next batch runs.
         self._unsent: list[Answer] = []
         self._answers = ThreadPoolExecutor(1, "policy-answers")
@@ -115,7 +102,7 @@ class Runner:
         """
         self._health.begin_thread()
         if not self.threaded:
-            self._models.start()
+            self._model.load()
             self._queue.bind(driven=True)
             return
 
@@ -123,6 +110,41 @@ class Runner:
         if not wait([self._started], self._load_s).done:
             raise TimeoutError(f"not loaded within {self._load_s:g} s, its limit")
         self._started.result()
+
+    def swap(self, config: Mapping[str, Any]) -> None:
+        """Load the policy with other settings, in place of the loaded one, on the policy's thread
+        after its running batch; return when the policy can act. One call at a time.
+
+        Raises:
+            BaseException: Any error of the policy's initialization.
+            TimeoutError: The policy does not load within the time limit.
+        """
+        swap = Swap(config)
+        if not self.threaded:
+            self._swap(swap)
+            return swap.done.result()
+
+        self._next_swap = swap
+        self._queue.interrupt()
+        if not wait([swap.done], self._load_s).done:
+            raise TimeoutError(f"not loaded within {self._load_s:g} s, its limit")
+        return swap.done.result()
+
+    def _swap(self, swap: Swap) -> None:
+        """Answer the waiting requests with an error, and load the policy with other settings."""
+        deliver(self._unsent)
+        self._unsent = []
+        _, waiting = self._queue.clear()
+        for pending in waiting:
+            self._intake.fail(pending, self._model.loading())
+        del waiting  # the requests refer to the model, whose memory must be freed
+
+        try:
+            self._model.load(swap.config)
+        except BaseException as error:  # noqa: BLE001 - raised again by swap(), on the caller's thread
+            swap.done.set_exception(error)
+        else:
+            swap.done.set_result(None)
 
     def join(self, timeout_s: float) -> None:
         """Wait at most `timeout_s` for the end of the thread. The queue must be closed."""
@@ -134,7 +156,7 @@ class Runner:
     def _serve(self) -> None:
         """Load the policy, and run its batches until the queue is closed."""
         try:
-            self._models.start()
+            self._model.load()
         except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
             self._health.end_thread()
             self._queue.poller.close()
@@ -164,6 +186,12 @@ class Runner:
                     acting.release()
                 del taken  # the observations may be in the sender's memory
 
+                if self._next_swap is not None:
+                    swap, self._next_swap = self._next_swap, None
+                    self._queue.poller.hand_to_reader()  # later requests are rejected at once
+                    self._swap(swap)
+                    self._queue.poller.reclaim()
+
             deliver(self._unsent)
             self._answers.shutdown()
             self._queue.poller.close()
@@ -173,9 +201,7 @@ class Runner:
     def _without_late(self, taken: Taken) -> Taken:
         """Return the work without requests that have become useless since they left the queue."""
         now = self._clock()
-        late = [
-            pending for pending in taken.batch if pending.loaded is None and pending.is_useless(now)
-        ]
+        late = [pending for pending in taken.batch if pending.is_useless(now)]
         self._queue.give_back(late)
         in_time = [pending for pending in taken.batch if pending not in late]
         return Taken(in_time, [*taken.expired, *late])
@@ -228,63 +254,21 @@ class Runner:
                 deliver(self._act(model, weights, group, prepared_s))
 
     def _reset(self, pending: PendingRequest, opening: Opening) -> Sequence[Answer]:
-        """Begin the episode of a reset, and return the answer to the reset, if it is due.
-
-        A reset whose checkpoint is not loaded leaves the queue. It is queued again when the
-        checkpoint is loaded, or answered with an error if loading fails. Meanwhile the session may
-        be reset again or closed, or its client may stop waiting.
-        """
-        session_id = pending.session_id
-        if pending.loaded is None:
-            if self._sessions.is_past(session_id, opening.first):
-                raise UnknownSession(
-                    f"session {session_id!r}: reset elsewhere, or ended, while this reset waited"
-                )
-
-            session = self._sessions.open(session_id, pending.origin)
-            self._sessions.end_episode(session, pending, opening.first)
-            model = session.model
-            if model is None:
-                session.weights = None  # no commit of a model may change it
-            else:
-                model.parameters.end(session)
-
-            waiting = WaitingReset(self, pending, session)
-            held = self._models.hold(session, opening.choice, waiting.end, waiting.is_abandoned)
-            if held is None:
-                # The policy does not work on the reset while its checkpoint is being loaded.
-                self._queue.give_back([pending])
-                return ()  # `requeue` queues the reset again
-        else:
-            session = self._sessions.get(session_id)
-            if session.resetting is not pending:
-                raise UnknownSession(
-                    f"session {session_id!r}: reset again, or closed, while this reset waited"
-                )
-            if self.is_abandoned(pending, session):
-                self._models.release_model(session)
-                raise too_late(opening.choice)
-
-        session.resetting = None
-        try:
-            return self._begin_episode(pending, opening, session)
-        except BaseException:
-            # The session must not hold the model without an episode.
-            self._models.release_model(session)
-            raise
-
-    def _begin_episode(
-        self, pending: PendingRequest, opening: Opening, session: Session[LoadedModel]
-    ) -> Sequence[Answer]:
-        """Begin an episode on the model that the session holds, and return the answer, if it is
-        due now.
-        """
-        request, model = pending.request, session.model
-        # The decoder ensures that a reset has an observation.
-        if model is None or request.obs is None:
+        """Begin the episode of a reset, and return the answer to the reset, if it is due now."""
+        session_id, request = pending.session_id, pending.request
+        if self._sessions.is_past(session_id, opening.first):
             raise UnknownSession(
-                f"session {pending.session_id!r}: closed before its reset was over"
+                f"session {session_id!r}: reset elsewhere, or ended, while this reset waited"
             )
+
+        session = self._sessions.open(session_id, pending.origin)
+        self._sessions.end_episode(session, pending, opening.first)
+        previous = session.model  # another thread may set the attribute to None
+        if previous is not None:
+            previous.parameters.end(session)
+        model = session.model = self._model.require_loaded()
+        if request.obs is None:  # the decoder ensures that a reset has an observation
+            raise PolicyFailed("reset: expected an observation, got none")
         model.check(request)
 
         with model.busy, model.uncaptured, model.call("reset") as call:
@@ -330,29 +314,6 @@ class Runner:
         self._finder.announce(session.id, session.steps, (pending, reply))
         return ()
 
-    def requeue(self, pending: PendingRequest, error: VLAgentsError | None) -> None:
-        """Queue a reset again, since its checkpoint is loaded, or answer it with the error; called
-        on any thread.
-        """
-        pending.loaded = self._clock()
-        try:
-            if error is not None:
-                raise error
-            self._queue.put(pending)
-        except VLAgentsError as reason:
-            pending.request.drop_observations()  # the session may still refer to the request
-            pending.fail(reason)
-
-    def is_abandoned(self, pending: PendingRequest, session: Session[LoadedModel]) -> bool:
-        """Return whether the caller of a reset no longer waits, or the session was reset again;
-        called on any thread.
-        """
-        return (
-            pending.is_abandoned
-            or pending.expired(self._clock())
-            or session.resetting is not pending
-        )
-
     def _other(self, pending: PendingRequest) -> Answer:
         """Run a request that is neither an act nor a reset, and return the answer."""
         session_id, request = pending.session_id, pending.request
@@ -393,7 +354,7 @@ class Runner:
         else:
             session = reserved.session
         model, weights = session.model, session.weights
-        # An earlier reset in the queue failed, or still waits for its checkpoint.
+        # An earlier reset in the queue failed.
         if session.agent is None:
             raise NotReset(f"session {pending.session_id!r}: its last reset failed; reset again")
         step = pending.request.step
@@ -404,8 +365,7 @@ class Runner:
             raise session.wrong_episode()
         if model is None or weights is None:
             raise UnknownSession(f"session {pending.session_id!r}: has just been closed; reset it")
-        # A reset that was queued before this request chose another model, or the session has
-        # arrived since.
+        # The session has arrived since the act was compared with the contract.
         if reserved is None or model is not reserved.model:
             model.check(pending.request)
         return session, model, weights

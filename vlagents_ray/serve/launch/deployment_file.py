@@ -5,7 +5,6 @@ checked before a start.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,15 +15,13 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, UnknownPolicy
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.overrides import YAML_SUFFIXES, Override, read_config_file, with_overrides
-from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
+from vlagents_ray.policies.base.checkpoint import CHECKPOINT, CHECKPOINT_STEP, STEP
 from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import find_entry, policy_class
 from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
-from vlagents_ray.serve.models.checkpoints import CHOICE, STEP, Checkpoints
 from vlagents_ray.serve.ports import LOOPBACK
 from vlagents_ray.serve.python_env.probe import check_policy, with_process
-from vlagents_ray.serve.requests import DEFAULT
 from vlagents_ray.settings import wrong_settings
 from vlagents_ray.yaml_text import read_yaml
 
@@ -118,8 +115,8 @@ def read_deployment(
         overrides: Changes of the args of the only policy of the deployment, such as
             `batch.max_size=8` or `config.gain=0.3`.
         app: The application that `overrides` change, if the file has several applications.
-        step_follows: Whether `with_settings` sets `checkpoint_step` later, so that a checkpoint
-            with `{step}` may lack it.
+        step_follows: Whether `checkpoint_step` is set later, so that a checkpoint with `{step}` may
+            lack it.
 
     Raises:
         ConfigError: The file or a setting is invalid.
@@ -308,13 +305,10 @@ def with_settings(
     config: Deployment,
     settings: Mapping[str, Any],
     *,
-    steps: bool = False,
     step_follows: bool = False,
 ) -> Deployment:
     """Return the deployment with these settings of its policies, which replace the settings in the
-    file.
-
-    With `steps`, sessions may choose any checkpoint step. See `read_deployment` for `step_follows`.
+    file. See `read_deployment` for `step_follows`.
     """
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
@@ -324,9 +318,32 @@ def with_settings(
             for settings_of_serve in app.deployments
             if settings_of_serve.get("name") != POLICY
         ]
-        if steps:
-            app.args["checkpoints"] = (app.args.get("checkpoints") or {}) | {"steps": True}
     return _checked(changed.model_dump(exclude_unset=True), "settings", step_follows)
+
+
+def with_user_config(
+    config: Deployment, settings: Mapping[str, Any], app: str | None = None
+) -> Deployment:
+    """Return the deployment with these settings of its policies in `user_config`, which Serve can
+    change without new replicas.
+
+    Args:
+        config: The deployment.
+        settings: The settings, which are added to the `user_config` in the file.
+        app: The application to change; None for all.
+    """
+    changed = config.model_copy(deep=True)
+    for application in our_apps(changed):
+        if app not in (None, application.name):
+            continue
+        options = next(
+            (options for options in application.deployments if options.get("name") == POLICY), None
+        )
+        if options is None:
+            options = {"name": POLICY}
+            application.deployments = [*application.deployments, options]
+        options["user_config"] = (options.get("user_config") or {}) | dict(settings)
+    return _checked(changed.model_dump(exclude_unset=True), "user_config")
 
 
 def with_replicas_on(config: Deployment, gpus: float) -> Deployment:
@@ -376,10 +393,7 @@ def declared_contract(config: Deployment) -> Contract | None:
     if len(config.applications) > 1 or app.import_path != IMPORT_PATH or app.runtime_env:
         return None
 
-    args = ServerArgs(**app.args)
-    make = partial(build_agent, args.policy, wrappers=args.wrappers)
-    checkpoints = args.checkpoints.of(make, own_settings(app))
-    return _contract(args, checkpoints, checkpoints.settings(DEFAULT, checkpoints.config))
+    return _contract(ServerArgs(**app.args), own_settings(app))
 
 
 def our_apps(config: Deployment) -> list[Application]:
@@ -428,8 +442,8 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
 def _require_policy(
     args: ServerArgs, config: dict[str, Any], *, installed: bool, step_follows: bool
 ) -> None:
-    """For each choice of a checkpoint, build the policy in its environment, and check that the
-    dialects fit the policy's contract. A replica repeats the check.
+    """Build the policy in its environment, and check that the dialects fit its contract. A replica
+    repeats the check.
 
     Args:
         args: The settings of the server.
@@ -446,21 +460,15 @@ def _require_policy(
         return
 
     args.dialects.require_packages()
-    make = partial(build_agent, args.policy, wrappers=args.wrappers)
-    checkpoints = args.checkpoints.of(make, config)
-    for choice in checkpoints.examples():
-        settings = checkpoints.settings(choice, checkpoints.config)
-        if step_follows and STEP_PLACE in str(settings.get(CHOICE)) and settings.get(STEP) is None:
-            settings |= {STEP: 0}
-        args.dialects.require_fit(_contract(args, checkpoints, settings))
+    lacks_step = STEP in str(config.get(CHECKPOINT)) and config.get(CHECKPOINT_STEP) is None
+    settings = config | {CHECKPOINT_STEP: 0} if step_follows and lacks_step else config
+    args.dialects.require_fit(_contract(args, settings))
 
 
-def _contract(
-    args: ServerArgs, checkpoints: Checkpoints, settings: dict[str, Any]
-) -> Contract | None:
+def _contract(args: ServerArgs, settings: dict[str, Any]) -> Contract | None:
     """Build the policy in its environment with these settings, and return its contract; None if it
     has no contract before it is loaded.
     """
     if args.environment.python is not None:
         return check_policy(args.environment, args.policy, settings, args.wrappers)
-    return unloaded_contract(checkpoints.make(settings))
+    return unloaded_contract(build_agent(args.policy, settings, args.wrappers))

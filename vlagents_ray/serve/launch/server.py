@@ -29,6 +29,7 @@ from vlagents_ray.ray_tools.reaper import MARK
 from vlagents_ray.registry import pip_install
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
+from vlagents_ray.serve.engine.health import NOT_LOADED
 from vlagents_ray.serve.launch import haproxy
 from vlagents_ray.serve.launch.deployment_file import (
     IMPORT_PATH,
@@ -150,9 +151,10 @@ def _end_serve(client: Any) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Server:
-    """The addresses of a running server."""
+    """The addresses of a running server, and its deployment."""
 
     url: str  # http(s)://host:port
+    deployed: Deployment  # the deployment, with the access settings of this process
     apps: Mapping[str, str] = field(default_factory=dict)  # URL of each application
     metrics: tuple[str, ...] = ()  # URL of the metrics of each node of Ray, for Prometheus
 
@@ -258,7 +260,7 @@ def running_server(
         if is_own_ray and ingress:
             session.announce(url, paths, ray.get_runtime_context().gcs_address)
         urls = {name: url + path for name, path in paths.items()}
-        yield Server(url, urls, session.metrics_urls())
+        yield Server(url, config, urls, session.metrics_urls())
 
 
 def _proxy_location(ingress: bool, address: str | None) -> str:
@@ -573,8 +575,13 @@ def wait_until_ready(
         status = serve.status().applications
         for name in apps:
             app = status.get(name)
-            if app is not None and app.status in ("DEPLOY_FAILED", "UNHEALTHY"):
-                raise ConfigError(f"application {name!r} failed to deploy: {_deploy_failure(app)}")
+            if app is None:
+                continue
+            failure = load_failure(app)
+            if failure is None and app.status == "UNHEALTHY":
+                failure = last_message(app)
+            if failure is not None:
+                raise ConfigError(f"application {name!r} failed to deploy: {failure}")
         if all(name in status and status[name].status == "RUNNING" for name in apps):
             break
 
@@ -591,21 +598,36 @@ def wait_until_ready(
 
     for name, url in apps.items():
         while (refusal := _unready_reason(serve, name, url, ours)) is not None:
-            if "did not load" in refusal:
+            if NOT_LOADED in refusal:
                 raise ConfigError(f"application {name!r}: {refusal}")
             if time.monotonic() > deadline:
                 raise PolicyUnavailable(f"application {name!r} is not ready: {refusal}")
             time.sleep(0.05)
 
 
-def _deploy_failure(app: Any) -> str:
-    """Return the reason why an application failed to deploy, from Serve's status of the
-    application.
+def load_failure(app: Any, earlier: str = "") -> str | None:
+    """Return the reason why an application failed to deploy, or why its policy did not load; None
+    if neither has happened.
+
+    Serve starts a replica again after a failure, as the replica may have been killed. A policy that
+    did not load once will fail again, so its failure is returned without waiting for the next one.
+
+    Args:
+        app: Serve's status of the application.
+        earlier: The last message before the deployment, which Serve may still report.
+    """
+    message = last_message(app)
+    has_failed = NOT_LOADED in message and message != earlier
+    return message if has_failed or app.status == "DEPLOY_FAILED" else None
+
+
+def last_message(app: Any) -> str:
+    """Return the last line of Serve's messages about an application, which is the error below its
+    traceback.
     """
     lines: list[str] = []
     for text in (app.message, *(deployment.message for deployment in app.deployments.values())):
         lines += [line.strip() for line in (text or "").splitlines() if line.strip()]
-    # The last line of Serve's message is the error below its traceback.
     return lines[-1] if lines else "Serve reports no reason"
 
 

@@ -1,4 +1,4 @@
-"""One checkpoint in memory, from loading it to releasing its memory."""
+"""A loaded agent with the data that its sessions share, and the loader that creates it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import logging
 import sys
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -15,22 +14,24 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol
 
-from vlagents_ray.abilities import DefersLoading, HasStatistics, ability
+from vlagents_ray.abilities import BeginsWithPlan, ContinuesPlans, HasStatistics, ability
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.act_stream import ActStream, GpuCalls
-from vlagents_ray.policies.base.checkpoint import used_checkpoints
+from vlagents_ray.policies.base.checkpoint import (
+    CHECKPOINT,
+    checkpoint_name,
+    resolved,
+    used_checkpoints,
+)
 from vlagents_ray.policies.base.checkpoint_files import identify_weights
 from vlagents_ray.policies.base.program import Program, digest_of, files_named, with_defaults
-from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.policies.loading import LoadingReport, loading_report
 from vlagents_ray.policies.wrapper import unwrapped
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.models.agent_copies import AgentCopies
-from vlagents_ray.serve.models.checkpoints import CHOICE, Checkpoints, resolved
 from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
-from vlagents_ray.serve.requests import CheckpointChoice
 from vlagents_ray.serve.weights import HoldsWeights, ModelWeights
 from vlagents_ray.validation import check_observation
 
@@ -122,8 +123,7 @@ class Padding:
 class LoadedModel:
     """A loaded agent, and the data that its sessions share."""
 
-    choice: CheckpointChoice  # the choice for which the model was loaded
-    settings: dict[str, Any]
+    settings: Mapping[str, Any]  # settings of the agent
     agent: Agent
     contract: Contract | None
     copies: AgentCopies
@@ -137,22 +137,21 @@ class LoadedModel:
     parameters: ModelWeights  # versions of the weights
     busy: threading.Lock  # lock that is held while the agent runs, or is being closed
     report: LoadingReport  # devices and other facts that the model reported while loading
-    since: float = field(default_factory=time.monotonic)  # time at which the model was loaded, s
-    sessions: int = 0  # number of sessions that use the model
+    continues_plans: bool  # whether chunks continue the executed plan
+    # Maximum number of rows of the executed plan that a chunk repeats exactly at its beginning; 0
+    # for none.
+    longest_prefix: int
     closed: bool = False
-    # The ability to load the deferred parts; None if the model is loaded completely.
-    deferred: DefersLoading | None = None
-    key: str = field(init=False)  # `key_of(settings)`
     # The stream of the agent's calls, on any thread; None without a GPU of torch.
     acts: ActStream | None = field(init=False)
-    # Held together with `busy` while the agent runs, so that no other model is captured as a CUDA
-    # graph. Without an accelerator, each model has a separate lock, which costs less.
+    # Held together with `busy` while the agent runs, so that no other model of this process is
+    # captured as a CUDA graph. Without an accelerator, each model has a separate lock, which costs
+    # less.
     uncaptured: AbstractContextManager[Any] = field(init=False)
     _calls_by_kind: dict[tuple[str, Hashable], PolicyCall] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Determine whether this process computes on an accelerator."""
-        self.key = key_of(self.settings)
         torch = sys.modules.get("torch")
         self.acts = ActStream.for_report(self.report)
         self.uncaptured = (
@@ -164,7 +163,7 @@ class LoadedModel:
     @property
     def checkpoint(self) -> str | None:
         """Name of the checkpoint, for the sessions."""
-        return resolved(self.settings) or self.choice.name
+        return checkpoint_name(self.settings)
 
     @property
     def identity(self) -> dict[str, str]:
@@ -201,14 +200,20 @@ class LoadedModel:
         holds `busy`.
         """
         if self.closed:
-            raise UnknownSession(
-                f"{self.choice} has just been unloaded for another checkpoint; reset the session"
-            )
+            raise self.replaced()
+
+    def replaced(self) -> UnknownSession:
+        """Return the error for a session of this model, which is closed."""
+        return UnknownSession(
+            "the policy has just been replaced by one with other settings; reset the session"
+        )
 
     def pad(self, observations: list[Obs | None], agents: list[Agent | None]) -> int:
         """Append rows that pad a batch to the next size, and return their number. It is only called
         on the policy's thread.
         """
+        if self.closed:
+            return 0
         with self.call("reset", "padding"):
             padding = self.padding.sessions(len(agents))
         observations += observations[-1:] * len(padding)
@@ -223,7 +228,7 @@ class LoadedModel:
         process ends.
         """
         if not self.busy.acquire(timeout=wait_s):
-            logger.error("%s: still busy after %g s; it is not closed", self.choice, wait_s)
+            logger.error("the policy is still busy after %g s; it is not closed", wait_s)
             return
         try:
             self.closed = True
@@ -265,12 +270,20 @@ class ModelStats(Protocol):
         """Record the time of a forward pass on the GPU."""
 
 
+@dataclass(frozen=True, slots=True)
+class PolicySource:
+    """The function that creates a policy's agents, and the settings of the first agent."""
+
+    make: Callable[[Mapping[str, Any]], Agent]  # creates an agent, without loading anything
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+
 class Loader:
     """Loads models from settings."""
 
     def __init__(
         self,
-        source: Checkpoints,
+        make: Callable[[Mapping[str, Any]], Agent],
         version: str,
         batch_sizes: Sequence[int],
         max_batch_size: int,
@@ -278,71 +291,29 @@ class Loader:
         calls: PolicyCalls,
         stats: ModelStats,
     ) -> None:
-        """Create the loader; `stats` records the reports of the models. `EngineSettings` describes
-        the other arguments.
+        """Create the loader; `make` is described at `PolicySource`, and `stats` records the reports
+        of the models. `EngineSettings` describes the other arguments.
         """
-        self._source, self._version, self._batch_sizes = source, version, batch_sizes
+        self._make, self._version, self._batch_sizes = make, version, batch_sizes
         self._compiled_sizes = batch_sizes or powers_up_to(max_batch_size)
         self._check, self._calls, self._stats = check, calls, stats
 
-    def load(
-        self,
-        choice: CheckpointChoice,
-        settings: dict[str, Any],
-        on_progress: Callable[[str], None],
-        agent: Agent | None = None,
-        *,
-        beside_acts: bool = False,
-    ) -> LoadedModel:
-        """Load a model into `agent`, by default a new one; the agent is closed if it cannot be
-        served.
+    def load(self, settings: Mapping[str, Any], on_progress: Callable[[str], None]) -> LoadedModel:
+        """Load a model into a new agent, which is closed if it cannot be served.
 
         Args:
-            choice: The choice for which the model is loaded.
             settings: The settings of the agent.
             on_progress: Called with each step of a long load.
-            agent: An agent created from the `settings`, but not initialized yet.
-            beside_acts: Whether other models compute actions meanwhile. The agent may then defer a
-                part of its loading to calls of `load_deferred`.
 
         Raises:
             BaseException: Any error of the agent's initialization, or of the deployment's check of
                 its contract.
         """
         with PolicyCall(self._calls, LOAD):
-            model = self._load(choice, settings, on_progress, agent, beside_acts)
-        model.deferred = ability(model.agent, DefersLoading) if beside_acts else None
-        return model
+            return self._load(settings, on_progress)
 
-    def load_deferred(self, model: LoadedModel) -> None:
-        """Continue the deferred loading of a model, between two of its calls.
-
-        The lock of pushes, which a capture needs, is acquired first, since a push also holds this
-        lock while it waits for the model.
-        """
-        with CAPTURES.pushes, model.busy:
-            if model.deferred is None or model.closed:
-                return
-            with PolicyCall(self._calls, LOAD):
-                try:
-                    is_complete = not model.deferred.load_deferred()
-                except Exception:
-                    logger.exception(
-                        "%s: the deferred loading failed; the model runs without it", model.choice
-                    )
-                    is_complete = True
-            if is_complete:
-                model.deferred = None
-
-    def _load(
-        self,
-        choice: CheckpointChoice,
-        settings: dict[str, Any],
-        on_progress: Callable[[str], None],
-        agent: Agent | None,
-        beside_acts: bool,
-    ) -> LoadedModel:
-        agent = agent or self._source.make(settings)
+    def _load(self, settings: Mapping[str, Any], on_progress: Callable[[str], None]) -> LoadedModel:
+        agent = self._make(settings)
         try:
             with (
                 used_checkpoints() as checkpoints,
@@ -351,14 +322,13 @@ class Loader:
                     self._compiled_sizes,
                     self._stats.out_of_memory,
                     self._stats.gpu,
-                    beside_acts=beside_acts,
                 ) as report,
             ):
                 agent.initialize()
             weights = identify_weights(agent, checkpoints)
             full_settings = with_defaults(type(unwrapped(agent)), settings)
             files = files_named(
-                {**full_settings, CHOICE: resolved(full_settings)}, folders=not weights
+                {**full_settings, CHECKPOINT: resolved(full_settings)}, folders=not weights
             )
             if weights is None and files:
                 weights = {"digest": digest_of(files), "revision": None}
@@ -377,6 +347,10 @@ class Loader:
             self._check(contract)
             copies = AgentCopies(agent)
             copies.make()  # an agent that cannot be copied must fail now, not at the first reset
+            plans = ability(agent, ContinuesPlans)
+            continues_plans = plans is not None and plans.continues_plans
+            prefixes = ability(agent, BeginsWithPlan)
+            longest_prefix = 0 if prefixes is None else prefixes.longest_prefix
         except BaseException:
             _close_agent(agent)
             raise
@@ -394,7 +368,6 @@ class Loader:
         parameters = make(busy, digest.rpartition(":")[2][:_FINGERPRINT_DIGITS], version)
         calls = self._calls
         return LoadedModel(
-            choice,
             settings,
             agent,
             contract,
@@ -407,16 +380,13 @@ class Loader:
             parameters,
             busy,
             report,
+            continues_plans,
+            longest_prefix,
         )
 
     def version(self, settings: Mapping[str, Any]) -> str:
         """Return the version of the policy that has these settings."""
-        return f"{self._version} {key_of(settings)}"
-
-
-def key_of(settings: Mapping[str, Any]) -> str:
-    """Return a key that is equal for equal settings."""
-    return json.dumps(settings, sort_keys=True)
+        return f"{self._version} {json.dumps(settings, sort_keys=True)}"
 
 
 def _close_agent(agent: Agent) -> None:

@@ -121,14 +121,14 @@ def run() -> None:
         sys.exit(1)
 
     contract = None if engine.contract is None else engine.contract.to_json()
-    models = engine.models
+    model = engine.model
     report(
         {
             "local": asdict(server.address),
             "contract": contract,
-            "weights": models.weights,
-            "uncompiled": models.uncompiled,
-            "devices": models.devices,
+            "weights": model.weights,
+            "uncompiled": model.uncompiled,
+            "devices": model.devices,
             "trained": _describe_trained(agent, engine.weights),
         }
     )

@@ -41,7 +41,7 @@ class LoadedPolicy:
 
     address: LocalAddress  # address of the child's server, which receives the requests
     contract: Contract | None
-    weights: dict[str, Any]  # see `ModelManager.weights`
+    weights: dict[str, Any]  # see `ServedModel.weights`
     trained: dict[str, Any]  # the values that a learner trains, see `child_main`
 
     @classmethod

@@ -84,6 +84,7 @@ class BatchQueue:
         self._closed = False
         self._thread = 0  # id of the policy's thread
         self._asleep = False
+        self._interrupted = False  # whether `next` must return without a request
         # Whether a caller of `take` drives the queue; each new request then wakes that caller.
         self._driven = False
         self._dense = False  # whether requests arrive in quick succession
@@ -111,7 +112,7 @@ class BatchQueue:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             for pending in requests:
-                self._load_timer.count(self._waiting.size, pending.loaded or pending.arrived)
+                self._load_timer.count(self._waiting.size, pending.arrived)
                 if self.window.slow:
                     self.window.record_arrival(pending)
                 self._waiting.add(pending)
@@ -120,9 +121,7 @@ class BatchQueue:
             self._wake()
 
     def withdraw(self, *requests: PendingRequest) -> None:
-        """End requests without an answer; no batch contains them later, except a reset whose
-        checkpoint was loaded.
-        """
+        """End requests without an answer; no batch contains them later."""
         with self._lock:
             for pending in requests:
                 pending.over = True
@@ -141,9 +140,15 @@ class BatchQueue:
             pending.over = True
             return True
 
+    def interrupt(self) -> None:
+        """Make `next` return now, even if no request waits. May be called on any thread."""
+        with self._lock:
+            self._interrupted = True
+            self._wake()
+
     def next(self) -> Taken | None:
-        """Wait for requests, and return the next batch; it is empty after `idle_s`, and None
-        after `close`.
+        """Wait for requests, and return the next batch; it is empty after `idle_s` and after
+        `interrupt`, and None after `close`.
         """
         if not self._wait_for_request():
             return Taken([], [])
@@ -156,6 +161,7 @@ class BatchQueue:
         with self._lock:
             now = self._clock()
             self._asleep = self._driven
+            self._interrupted = False
             self._load_timer.count(self._waiting.size, now)
             if self._closed:
                 return None
@@ -221,14 +227,6 @@ class BatchQueue:
         """Return the number of requests that wait for the next batch, by priority."""
         return dict(zip(Priority, self._waiting.depth, strict=True))
 
-    def quiet_s(self) -> float:
-        """Return the time since the last batch began, s; 0 while a batch runs, or requests wait.
-        May be called on any thread.
-        """
-        if self._running or self._waiting.size:
-            return 0.0
-        return self._clock() - self._begun
-
     def load_s(self) -> tuple[float, float]:
         """Return the total idle time of the policy's thread, and the total waiting time of all
         requests so far, s. The growth rate of the waiting time is the mean queue length.
@@ -259,11 +257,11 @@ class BatchQueue:
         """
         while True:
             with self._lock:
-                ready = self._closed or self._waiting.size > 0
+                ready = self._closed or self._interrupted or self._waiting.size > 0
                 self._asleep = not ready
             had_event = self.poller.poll(0.0) if ready else self._wait_for_event()
             self._asleep = False
-            if ready or self._waiting.size > 0 or self._closed:
+            if ready or self._waiting.size > 0 or self._closed or self._interrupted:
                 return True
             if not had_event:
                 return False

@@ -308,13 +308,11 @@ class FairQueue:
             self.depth[pending.priority] -= 1
             self.size -= 1
 
-            # A reset whose checkpoint was loaded must run, so that the checkpoint is released.
-            if pending.loaded is None:
-                if pending.over:
-                    continue
-                if pending.is_useless(now):
-                    expired.append(pending)
-                    continue
+            if pending.over:
+                continue
+            if pending.is_useless(now):
+                expired.append(pending)
+                continue
 
             pending.begun = True
             batch.append(pending)

@@ -181,8 +181,8 @@ class Exporter:
         self._utilisation.set(self._meter.read().utilisation)
         self._slo_load.set(self._robots_load.read().load)
         self._version.set(self._engine.weights.number)
-        self._uncompiled.set(len(self._engine.models.uncompiled))
-        for kind, size in self._engine.models.gpu_memory().items():
+        self._uncompiled.set(len(self._engine.model.uncompiled))
+        for kind, size in self._engine.model.gpu_memory().items():
             self._gpu_memory.set(size, {"kind": kind})
 
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)

@@ -183,9 +183,10 @@ class PolicyReplica(ClientApi, SiblingApi):
         settings change.
 
         The first call loads the policy, so that Serve reports RUNNING only when the policy can act,
-        and `serve status` shows the reason if it cannot. Later calls return immediately and raise
-        no error, since an error would end the replica. The metadata and the log show the result of
-        the swap.
+        and `serve status` shows the reason if it cannot. A later call loads the policy with the new
+        settings in place of the current one. Serve calls this method of one replica after another,
+        and sends no clients to a replica during the call. After an error, Serve replaces the
+        replica; if the new settings fail again, other replicas keep the old ones.
 
         Args:
             settings: The policy's settings that replace those in `args`.
@@ -193,15 +194,9 @@ class PolicyReplica(ClientApi, SiblingApi):
                 no `user_config`.
         """
         config = {**self._args.config, **(settings or {})}
-        if self._configured:
-            logger.info("new settings, to be loaded next to the current ones: %s", config)
-        self._engine.models.configure(config)
-        if self._configured:
-            return
-
-        self._configured = True
+        is_first, self._configured = not self._configured, True
         try:
-            await asyncio.to_thread(self._engine.start)
+            await asyncio.to_thread(self._engine.start if is_first else self._engine.swap, config)
         except PolicyFailed as error:
             if not isinstance(error.__cause__, VLAgentsError):
                 raise
@@ -210,6 +205,11 @@ class PolicyReplica(ClientApi, SiblingApi):
             # show both tracebacks first.
             raise PolicyFailed(str(error)) from None
 
+        if is_first:
+            await self._begin()
+
+    async def _begin(self) -> None:
+        """Start the replica's periodic tasks, before Serve reports that it runs."""
         await self._parts.before_ready()
 
         works = [
@@ -399,7 +399,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             accepts,
             node,
             boot_id(),
-            self._engine.models.version,
+            self._engine.model.version,
             needed.robots,
             needed.load,
         )

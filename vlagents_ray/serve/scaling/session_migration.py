@@ -74,7 +74,7 @@ _ANSWER_S = 3.0
 _OTHERS_S = 0.3
 _SILENT_S = 3.0  # time for which a silent replica gets no further requests, s
 _ATTEMPTS = 5  # number of attempts after which a search is given up, if `ARRIVAL_S` has also passed
-_LOAD_S = 60.0  # time limit for loading the checkpoint of a fetched session
+_WEIGHTS_S = 60.0  # time limit for the weights of a fetched session
 _BATCH_S = 0.002  # time for which searches are collected into one query
 _GATHER_S = 0.02  # time for which new episodes are collected into one announcement
 _AT_ONCE = 16  # largest number of sessions that are handed over, or unpickled, at a time
@@ -558,7 +558,7 @@ class SessionMigrator:
             """
             create = self._engine.moves.prepare
             arriving: Session[LoadedModel] = await self._in_thread(
-                create, session_id, state, _LOAD_S, began, origin, weights
+                create, session_id, state, began, origin, weights
             )
             return arriving
 
@@ -568,7 +568,7 @@ class SessionMigrator:
             try:
                 return await prepare()  # another session may have fetched the weights meanwhile
             except VersionNotHeld:
-                weights = await self._answer(peer.ask(HeldSessions.weights, session_id), _LOAD_S)
+                weights = await self._answer(peer.ask(HeldSessions.weights, session_id), _WEIGHTS_S)
                 if weights is None:
                     raise
             return await prepare(weights)

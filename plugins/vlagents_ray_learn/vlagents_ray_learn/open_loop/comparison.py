@@ -33,7 +33,6 @@ from vlagents_ray.recorded_dataset import (
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import own_settings, policy_application
 from vlagents_ray.serve.local_agent import LocalPolicy
-from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
 from vlagents_ray.serve.weights import OPTION
 
 OpenSession = Callable[[], Agent]  # the caller closes the session
@@ -43,9 +42,6 @@ _WORST_FRAMES = 10  # number of worst frames that the result lists
 # Number of concurrent sessions, which share batches. Every policy has memory for eight rows, and
 # larger batches are hardly faster.
 _SESSIONS = 8
-# Recorded options of a reset that select weights of the recorded policy. Other policies do not have
-# these weights.
-_CHOICES_OF_WEIGHTS = (CHOICE, STEP, OPTION)
 
 
 @contextmanager
@@ -309,9 +305,9 @@ def _answers(
     session: RecordedSession, agent: Agent, plan: OpenLoopPlan
 ) -> Iterator[tuple[RecordedEpisode, RecordedStep, np.ndarray]]:
     """Yield the frames of a session, each with the policy's actions, (H, D)."""
-    options = {
-        name: value for name, value in session.options.items() if name not in _CHOICES_OF_WEIGHTS
-    }
+    # The recorded option selects weights that were pushed to the recorded policy. Other policies do
+    # not have these weights.
+    options = {name: value for name, value in session.options.items() if name != OPTION}
     is_reset = False
     for episode in session.episodes:
         stride = 1 if episode.dataset.traced else plan.stride

@@ -63,7 +63,7 @@ def serving(policy: Agent) -> Iterator[Server]:
         metadata["weights"] = {"statistics": trained_on.statistics}
 
     def describe() -> dict[str, object]:
-        return metadata | {"continues_plans": engine.models.continues_plans}
+        return metadata | {"continues_plans": engine.model.continues_plans}
 
     with served(
         AccessMiddleware(build_http_app(engine, describe, DEFAULT_LIMITS), known.keys, "app")
