@@ -52,7 +52,6 @@ __all__ = [
     "Interruptible",
     "Observes",
     "Prepares",
-    "ReadsSlo",
     "Sleeps",
     "Speculative",
     "Trainable",
@@ -276,16 +275,6 @@ class CountsTicks(InProcess, Protocol):
     timeliness: Any
     """The `vlagents_ray.chunking.timeliness.Timeliness` of the episode, which a reset replaces. The
     control loop adds the ticks at which it was too busy to call `act`.
-    """
-
-
-@runtime_checkable
-class ReadsSlo(InProcess, Protocol):
-    """The policy's server reports whether it can meet a robot's service level objective (SLO)."""
-
-    reads_slo: bool
-    """Whether `reset` accepts the option `slo`, a dict with the fields of a `vlagents_ray.slo.Slo`,
-    and returns an entry `slo` in its info: {"load": …, "in_time": …, "reason": …}.
     """
 
 

@@ -73,10 +73,6 @@ EXECUTED_AGE = "executed_age_ms"
 # In the Act of a server under load, float: how long the robot should wait after this answer before
 # its next request, ms.
 REPLAN = "replan_ms"
-# An option of `reset`: the robot's service level objective, as `vlagents_ray.slo.Slo.to_json`
-# returns it. In the info that `reset` returns: {"load": float, "in_time": bool}, and "reason", a
-# str, if `in_time` is False.
-SLO = "slo"
 # In the Act of a policy that was trained to continue given rows, int: the number of rows of
 # LEFTOVER with which its chunk begins. If the robot has executed more rows when the chunk arrives,
 # the chunk is dropped, since it continues from a pose that the robot has left.

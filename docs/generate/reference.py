@@ -59,7 +59,6 @@ SEE = {
     "ServerArgs.checkpoints": "checkpoints.md",
     "ServerArgs.autoscaling": "cluster/scaling.md",
     "ServerArgs.batch": "serving.md#batches",
-    "ServerArgs.slo": "fleet.md",
     "ServerArgs.access": "keys.md",
     "ServerArgs.environment": "python_environments.md",
     "ServerArgs.dialects": "other_clients.md",

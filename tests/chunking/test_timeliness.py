@@ -10,7 +10,7 @@ from eval_fakes import wait_for
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, PolicyUnavailable
+from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs, PolicyUnavailable
 from vlagents_ray.chunking import player as player_module
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.chunking.timeliness import Timeliness, TimeShare, in_words
@@ -25,7 +25,6 @@ from vlagents_ray.interface import (
     SLACK,
     TICKS,
 )
-from vlagents_ray.slo import Slo
 
 
 class Answers(Agent):
@@ -40,13 +39,10 @@ class Answers(Agent):
         self.infos: list[dict[str, Any]] = []  # infos of the observations in its requests
         self.answer_info: dict[str, Any] = {}
         self.failure: Exception | None = None
-        self.options: dict[str, Any] = {}
         self.let = 1  # number of requests that it answers
         self.answered = 0
-        self.reads_slo = True
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
-        self.options = kwargs
         return {}
 
     def act(self, obs: Obs) -> Act:
@@ -322,45 +318,3 @@ def test_figures_have_nearest_rank_ages_and_are_unknown_without_ticks() -> None:
         "p99 99 ms"
     )
     assert in_words(TimeShare(3, 3)) == "in time: 0.00% of 3 ticks of the policy"
-
-
-def test_a_player_states_the_rows_that_it_executes_at_most() -> None:
-    agent = Answers(8)
-    player = ChunkPlayer(agent, PlayerSettings(mode="async", horizon=3))
-    assert player.reads_slo
-    player.reset(Obs(), "stack", slo={"hz": 10.0})
-    assert agent.options == {"slo": {"hz": 10.0, "rows": 3}}
-    agent.let = 10**9
-    player.close()
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        None,
-        [],
-        {},
-        {"hz": 0},
-        {"hz": "10"},
-        {"hz": True},
-        {"hz": float("nan")},
-        {"hz": 10**400},
-        {"hz": 10, "age_ms": -1},
-        {"hz": 10, "rows": 0},
-        {"hz": 10, "rows": 2.5},
-        {"hz": 10, "share": 0},
-        {"hz": 10, "share": 1.1},
-        {"hz": 10, "age": 5},
-        {"hz": 10, "x" * 10_000: 5},
-    ],
-)
-def test_an_slo_that_cannot_be_is_refused(wrong: Any) -> None:
-    with pytest.raises(ConfigError, match=r"slo.*: expected .*, got ") as refused:
-        Slo.from_json(wrong)
-    assert len(str(refused.value)) < 400
-
-
-def test_an_slo_is_what_its_json_says() -> None:
-    slo = Slo(10, rows=8, age_ms=150.0, share=0.9)
-    assert Slo.from_json(slo.to_json()) == slo
-    assert Slo(5).to_json() == {"hz": 5, "share": 0.98}

@@ -34,7 +34,6 @@ METADATA: dict[str, Any] = {
     "local": None,
     "stream": None,
     "weights": {"digest": "d", "statistics": {"state": {"min": [0.0], "max": [1.0]}}},
-    "reads_slo": True,
 }
 ADDRESSES = {
     "local": {"socket": "vlagents-ray-none", "boot_id": "another machine", "keyed": False},

@@ -6,14 +6,12 @@ it can forge a log line.
 from __future__ import annotations
 
 import contextlib
-import logging
 from typing import Any
 
 import numpy as np
 import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs, VLAgentsError
-from vlagents_ray.cli.robot import _say_timeliness
 from vlagents_ray.robot import run_loop
 from vlagents_ray.robot.loop import LoopReport
 
@@ -42,7 +40,6 @@ class Told(Agent):
     """A policy that acts, and returns the given info of a server."""
 
     contract = Contract(action=ActionSpec(dim=2, delta=False))
-    reads_slo = True
 
     def __init__(self, info: Any = None, statistics: Any = None) -> None:
         self.info, self.statistics = info, statistics
@@ -53,27 +50,6 @@ class Told(Agent):
 
     def act(self, obs: Obs) -> Act:
         return Act(np.zeros(2, np.float32))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("value", VALUES, ids=range(len(VALUES)))
-@pytest.mark.parametrize("field", ["info", "slo", "load", "in_time", "reason"])
-def test_an_answer_to_an_slo_of_any_type_ends_no_run_and_forges_no_line(
-    field: str, value: Any, caplog: pytest.LogCaptureFixture
-) -> None:
-    answer: Any = {"load": 2.0, "in_time": False, "reason": "too many robots"}
-    if field in answer:
-        answer = answer | {field: value}
-    info = value if field == "info" else {"slo": value if field == "slo" else answer}
-
-    said: list[str] = []
-    with caplog.at_level(logging.WARNING):
-        report = run_loop(Arm(), Told(info), hz=HZ, seconds=2 / HZ)
-    _say_timeliness(report, said.append)
-    lines = [*said, *(record.getMessage() for record in caplog.records)]
-    assert all(line.isprintable() for line in lines)
-    if field in ("load", "reason"):
-        assert any(line.startswith("slo: ") for line in lines)
 
 
 @pytest.mark.parametrize("value", VALUES, ids=range(len(VALUES)))

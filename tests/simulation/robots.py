@@ -2,8 +2,8 @@
 replica.
 
 `python -m tests.simulation.robots --seeds 100000` runs random worlds, and checks each; `python -m
-tests.simulation.robots --fleets` prints the largest fleets in time, with the queue's use of slack
-and without it.
+tests.simulation.robots --fleets` prints the largest fleets in time, and the robots in time of smaller
+and larger fleets: without slack, with the order by slack, and with the pace as well.
 """
 
 from __future__ import annotations
@@ -14,17 +14,16 @@ import itertools
 import math
 import random
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from in_flight import AnySession, message_of_one
 
 from vlagents_ray.protocol.messages import Priority, Request
-from vlagents_ray.serve.fleet import CostCurve, RobotNeed, replica_load
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.fair_queue import BEHIND_OTHERS_S, PATIENCE_S
 from vlagents_ray.serve.queue.replica_pace import ReplicaPace, RobotPlan
+from vlagents_ray.serve.queue.robots_load import CostCurve
 from vlagents_ray.serve.requests import Origin, PendingRequest
 
 PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled
@@ -52,7 +51,6 @@ class Robot:
     hz: float
     rows: int
     states_slack: bool = True
-    states_slo: bool = True  # whether its rate is known from its reset
     lies: bool = False  # whether it claims in each request to be about to run out of rows
     obeys: bool = True  # whether it replans at the requested pace
     source: str = ""
@@ -66,12 +64,8 @@ class Robot:
     waiting: PendingRequest | None = None
     waits_until: float = 0.0  # time before which a request is useless, s
     inference_s: float = 0.0  # duration of its last batch
-    late: list[float] = field(default_factory=list)  # times of its starved ticks, s
+    late_s: float = 0.0  # time of its last starved tick, s
     plan: RobotPlan = field(default_factory=RobotPlan)
-
-    def __post_init__(self) -> None:
-        if self.states_slo:
-            self.plan = RobotPlan(RobotNeed(self.hz, self.rows), is_stated=True)
 
 
 @dataclass
@@ -132,7 +126,8 @@ class World:
 
     def run(self, seconds: float) -> World:
         """Run the world for so many seconds."""
-        for robot in self.robots:
+        for index, robot in enumerate(self.robots):
+            robot.plan.began = index - len(self.robots)  # their resets were before the first tick
             round_s = max(1.0, robot.rows / robot.hz)
             phase = self.draw.random() * (round_s if self.begin_s is None else self.begin_s)
             self.at(phase, lambda robot=robot, phase=phase: self._tick(robot, phase, 0))
@@ -167,7 +162,7 @@ class World:
                 robot.ages.append(self.now - robot.captured)
         else:
             robot.starved += is_measured
-            robot.late.append(self.now)
+            robot.late_s = self.now
 
     def _ask(self, robot: Robot, slack_s: float, at: float) -> None:
         arrived = self.now + WIRE_S
@@ -320,33 +315,16 @@ class World:
             robot.ticks > 0 and 1 - robot.starved / robot.ticks >= 0.98 for robot in self.robots
         )
 
-    def all_in_time_s(self) -> float:
-        """Return the time after which at least 98 % of each robot's ticks had an action."""
-        return max(_in_time_from_s(robot, self.now) for robot in self.robots)
-
     def share(self) -> float:
         """Return the lowest share in time of all robots."""
         return min(
             (1 - robot.starved / robot.ticks if robot.ticks else 0.0) for robot in self.robots
         )
 
-    def mean_share(self) -> float:
-        """Return the share in time over all ticks of all robots."""
-        ticks = sum(robot.ticks for robot in self.robots)
-        return 1 - sum(robot.starved for robot in self.robots) / max(1, ticks)
-
     def age_p95_s(self) -> float:
         """Return the 95th percentile of the age of executed actions, in s."""
         ages = sorted(age for robot in self.robots for age in robot.ages)
         return ages[int(0.95 * len(ages))] if ages else math.nan
-
-
-def _in_time_from_s(robot: Robot, until_s: float) -> float:
-    """Return the time from which at least 98 % of a robot's ticks had an action, in s."""
-    for count, late_s in enumerate(reversed(robot.late), start=1):
-        if count > 0.02 * (until_s - late_s) * robot.hz:
-            return late_s
-    return 0.0
 
 
 def fleet(number: int, *kinds: tuple[int, float]) -> list[Robot]:
@@ -357,10 +335,23 @@ def fleet(number: int, *kinds: tuple[int, float]) -> list[Robot]:
     ]
 
 
-def play(costs: CostCurve, number: int, slack: bool, *kinds: tuple[int, float]) -> World:
-    """Run a fleet for long enough to settle."""
+def play(
+    costs: CostCurve, number: int, slack: bool, *kinds: tuple[int, float], obeys: bool = True
+) -> World:
+    """Run a fleet for long enough to settle.
+
+    Args:
+        costs: The durations of batches.
+        number: The number of robots.
+        slack: Whether the queue uses the slack of the robots.
+        kinds: The kinds of robots, which take turns: rows of a chunk, and Hz.
+        obeys: Whether the robots replan at the requested pace.
+    """
     longest_s = max(rows / hz for rows, hz in kinds)
-    world = World(costs, fleet(number, *kinds), seed=number, slack=slack)
+    robots = fleet(number, *kinds)
+    for robot in robots:
+        robot.obeys = obeys
+    world = World(costs, robots, seed=number, slack=slack)
     world.measured_from = 4 * longest_s + 2
     # With a shorter measurement, a robot with only two late ticks would have less than 98 % in
     # time.
@@ -368,11 +359,11 @@ def play(costs: CostCurve, number: int, slack: bool, *kinds: tuple[int, float]) 
     return world.run(world.measured_from + measured_s)
 
 
-def largest(costs: CostCurve, slack: bool, *kinds: tuple[int, float]) -> int:
+def largest(costs: CostCurve, slack: bool, *kinds: tuple[int, float], obeys: bool = True) -> int:
     """Return the largest fleet in which 98 % of each robot's ticks have an action."""
 
     def fits(number: int) -> bool:
-        return play(costs, number, slack, *kinds).share() >= 0.98
+        return play(costs, number, slack, *kinds, obeys=obeys).share() >= 0.98
 
     low, high = 0, 2
     while fits(high):
@@ -401,7 +392,7 @@ def print_starts() -> None:
         for number, slack in itertools.product(numbers, (False, True)):
             robots = start_at_once(PI0, number, slack, *kinds).robots
             starved_s = [robot.starved / robot.hz for robot in robots]
-            last_s = max(robot.late[-1] if robot.late else 0.0 for robot in robots)
+            last_s = max(robot.late_s for robot in robots)
             in_time = sum(robot.starved <= 0.02 * robot.ticks for robot in robots)
             print(
                 f"{number:6}  {rows:8} {slack!s:6} {sum(starved_s) / number:6.2f} "
@@ -410,79 +401,32 @@ def print_starts() -> None:
             )
 
 
-def most_of(costs: CostCurve, needs: Sequence[RobotNeed]) -> int:
-    """Return the largest fleet according to the formula, for robots with these needs in turn."""
-    number = 0
-    while True:
-        counts = Counter(needs[index % len(needs)] for index in range(number + 1))
-        if not replica_load(costs, counts, LARGEST).in_time:
-            return number
-        number += 1
+# The ways to serve robots: without slack, with the order by slack, and with the pace as well.
+WAYS = {
+    "no slack": {"slack": False, "obeys": True},
+    "slack": {"slack": True, "obeys": False},
+    "slack and pace": {"slack": True, "obeys": True},
+}
 
 
 def print_fleets() -> None:
-    """Print the largest fleets in time and the age of actions at half load."""
-    print("costs  fleet              arithmetic  plain  slack  ratio  age p95 at half: plain slack")
-    fleets = {
-        "50 rows": [(50, 10.0)],
+    """Print the largest fleets in time, and the robots in time of smaller and larger fleets."""
+    print("of 100 %: the largest fleet with slack and pace")
+    print("fleet          way             largest  in time at 70 %  at 105 %  at 125 %")
+    for name, kinds in {
         "8 rows": [(8, 10.0)],
         "50 and 8 rows": [(50, 10.0), (8, 10.0)],
-        "50 and 1 row": [(50, 10.0), (1, 5.0)],
-        "1 row at 5 Hz": [(1, 5.0)],
-    }
-    for label, costs in (("pi0", PI0), ("graphs", GRAPHS)):
-        for name, kinds in fleets.items():
-            needs = [RobotNeed(hz, rows) for rows, hz in kinds]
-            bound = most_of(costs, needs)
-            before, after = (largest(costs, slack, *kinds) for slack in (False, True))
-            ages = [
-                play(costs, max(1, before // 2), slack, *kinds).age_p95_s()
-                for slack in (False, True)
-            ]
-            print(
-                f"{label:6} {name:18} {bound:10} {before:6} {after:6} {after / max(1, before):6.2f}"
-                f"  {ages[0]:.3f} {ages[1]:.3f} s",
-                flush=True,
-            )
-
-
-def print_overload() -> None:
-    """Print the results of fleets that all start at once, and of fleets that are too large."""
-    print("all start at once     states an SLO  slack  share  in time  s until all are in time")
-    for robots in (200, 400):
-        for states_slo in (True, False):
-            for slack in (False, True):
-                started = fleet(robots, (50, 10.0))
-                for robot in started:
-                    if not states_slo:
-                        robot.states_slo, robot.plan = False, RobotPlan()
-                world = World(PI0, started, seed=1, slack=slack, begin_s=0.5).run(60.0)
-                print(
-                    f"{robots:4} of 50 rows          {states_slo!s:14} {slack!s:5}  "
-                    f"{world.mean_share():.3f}  {world.in_time():6}  {world.all_in_time_s():.1f}",
-                    flush=True,
-                )
-    print("too many              load  slack  share  in time")
-    too_many: dict[str, tuple[int, list[tuple[int, float]]]] = {
-        "96 of 50 and 8 rows": (96, [(50, 10.0), (8, 10.0)]),
-        "120 of 50 and 8 rows": (120, [(50, 10.0), (8, 10.0)]),
-        "64 of 8 rows": (64, [(8, 10.0)]),
-        "500 of 50 rows": (500, [(50, 10.0)]),
-    }
-    for name, (robots, kinds) in too_many.items():
-        counts = Counter(
-            RobotNeed(hz, rows)
-            for rows, hz in (kinds[index % len(kinds)] for index in range(robots))
-        )
-        load = replica_load(PI0, counts, LARGEST).load
-        for slack in (False, True):
-            world = World(PI0, fleet(robots, *kinds), seed=1, slack=slack)
-            world.measured_from = 20.0
-            world.run(60.0)
-            print(
-                f"{name:21} {load:.2f}  {slack!s:5}  {world.mean_share():.3f}  {world.in_time():6}",
-                flush=True,
-            )
+        "50 rows": [(50, 10.0)],
+    }.items():
+        most = largest(PI0, True, *kinds)
+        for way, options in WAYS.items():
+            in_time = []
+            for part in (0.7, 1.05, 1.25):
+                number = round(part * most)
+                world = play(PI0, number, options["slack"], *kinds, obeys=options["obeys"])
+                in_time.append(f"{world.in_time()} of {number}")
+            found = largest(PI0, options["slack"], *kinds, obeys=options["obeys"])
+            print(f"{name:14} {way:15} {found:7}  {'  '.join(in_time)}", flush=True)
 
 
 def drawn(seed: int) -> World:
@@ -497,7 +441,6 @@ def drawn(seed: int) -> World:
             draw.choice([5.0, 10.0]),
             draw.choice([1, 8, 50]),
             states_slack=draw.random() < 0.7,
-            states_slo=draw.random() < 0.5,
             lies=draw.random() < 0.1,
             obeys=draw.random() < 0.8,
             source=draw.choice(["", "", "cell"]),
@@ -537,11 +480,6 @@ def main() -> None:
     parser.add_argument(
         "--starts", action="store_true", help="print fleets whose robots all start at once"
     )
-    parser.add_argument(
-        "--overload",
-        action="store_true",
-        help="print fleets that start at once, and fleets that are too large",
-    )
     options = parser.parse_args()
 
     began = time.monotonic()
@@ -555,8 +493,6 @@ def main() -> None:
         print_starts()
     if options.fleets:
         print_fleets()
-    if options.overload:
-        print_overload()
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from tests.simulation.robots import (
     GRAPHS,
     PI0,
     SMALL,
+    WAYS,
     Robot,
     World,
     fleet,
@@ -20,8 +21,7 @@ from tests.simulation.robots import (
     play_drawn,
     start_at_once,
 )
-from vlagents_ray.serve.fleet import CostCurve
-from vlagents_ray.serve.queue.replica_pace import RobotPlan
+from vlagents_ray.serve.queue.robots_load import CostCurve
 
 
 @pytest.mark.slow
@@ -55,6 +55,34 @@ def test_slack_serves_a_third_more_robots_with_chunks_of_50(
     """Each number is more than 1.3 times the largest fleet without slack."""
     assert play(PI0, robots, True, *kinds).share() >= 0.98
     assert play(PI0, round(robots / 1.3), False, *kinds).share() < 0.98
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kinds", "most", "gain"),
+    [
+        ([(8, 10.0)], 46, 1.15),
+        ([(50, 10.0), (8, 10.0)], 83, 1.8),
+        ([(50, 10.0)], 400, 1.6),
+    ],
+)
+def test_slack_and_pace_serve_more_robots_than_slack_and_these_more_than_none(
+    kinds: list[tuple[int, float]], most: int, gain: float
+) -> None:
+    """Neither is worth its code alone: without the pace, the order by slack breaks down as soon as
+    the replica is full, and without a rule for too many robots, all of them are late.
+    """
+    assert play(PI0, most, True, *kinds).share() >= 0.98
+    assert play(PI0, round(most / gain), False, *kinds).share() < 0.98
+
+    for part in (0.7, 1.05, 1.25):
+        number = round(part * most)
+        no_slack, no_pace, both = (
+            play(PI0, number, way["slack"], *kinds, obeys=way["obeys"]).in_time()
+            for way in WAYS.values()
+        )
+        assert both >= max(no_slack, no_pace), part
+        assert both >= 0.9 * min(number, most), part
 
 
 @pytest.mark.slow
@@ -101,11 +129,8 @@ def test_a_robot_that_claims_to_have_no_slack_gains_nothing_over_today() -> None
     assert ages_s[1] <= ages_s[0], "the other robots have no older actions because of it"
 
 
-def test_a_robot_without_an_slo_is_paced_by_what_it_does() -> None:
+def test_the_needs_of_robots_are_read_from_their_requests() -> None:
     robots = fleet(200, (50, 10.0))
-    for robot in robots:
-        robot.states_slo = False
-        robot.plan.need, robot.plan.is_stated = None, False
     world = World(PI0, robots, seed=4).run(30.0)
     needs = {robot.plan.need for robot in robots}
     assert all(need is not None and need.rows == 50 for need in needs)
@@ -114,22 +139,19 @@ def test_a_robot_without_an_slo_is_paced_by_what_it_does() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("states_slo", [True, False])
-def test_robots_that_all_start_at_once_are_soon_in_time(states_slo: bool) -> None:
-    robots = fleet(400, (50, 10.0))
-    for robot in robots:
-        if not states_slo:
-            robot.states_slo, robot.plan = False, RobotPlan()
-    world = World(PI0, robots, seed=1, begin_s=0.5).run(60.0)
-    assert world.all_in_time_s() <= (10.0 if states_slo else 20.0)
+def test_robots_that_all_start_at_once_are_soon_in_time() -> None:
+    world = World(PI0, fleet(400, (50, 10.0)), seed=1, begin_s=0.5)
+    world.measured_from = 10.0
+    assert world.run(60.0).share() >= 0.98
 
 
-def test_robots_that_came_first_are_in_time_where_there_are_too_many() -> None:
+def test_robots_of_the_oldest_episodes_are_in_time_where_there_are_too_many() -> None:
     kinds = [(50, 10.0), (8, 10.0)]
     world = World(PI0, fleet(120, *kinds), seed=1)
     world.measured_from = 20.0
     world.run(60.0)
-    admitted = [robot for robot in world.robots if robot.plan.is_admitted]
-    assert 0.7 * 96 <= len(admitted) < 96
-    assert world.in_time() >= 0.9 * len(admitted)
+    first = [robot for robot in world.robots if not robot.plan.waits_behind_others]
+    assert 0.7 * 96 <= len(first) < 96
+    assert world.robots[: len(first)] == first, "the robots began in this order"
+    assert sum(robot.starved <= 0.02 * robot.ticks for robot in first) >= 0.9 * len(first)
     assert min(robot.ticks - robot.starved for robot in world.robots) > 0, "each robot gets actions"

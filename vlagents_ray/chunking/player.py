@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
-from vlagents_ray.abilities import HasStatistics, Observes, ReadsSlo, ability
+from vlagents_ray.abilities import HasStatistics, Observes, ability
 from vlagents_ray.chunking.buffer import (
     ENSEMBLE,
     ENSEMBLE_M,
@@ -58,7 +58,6 @@ from vlagents_ray.interface import (
     SAFE,
     SILENT,
     SLACK,
-    SLO,
     TICKS,
     WANTED,
     Act,
@@ -335,9 +334,6 @@ class ChunkPlayer(Agent):
         self._begin()
         obs = stamped(obs, {})
         self._captured(obs)  # called before the reset of the policy, which may take long
-        slo = kwargs.get(SLO)
-        if slo is not None and self.settings.horizon is not None:
-            kwargs[SLO] = {"rows": self.settings.horizon, **slo}
         info = self._agent.reset(obs, instruction, **kwargs)
         self._choose_safe()
 
@@ -350,12 +346,6 @@ class ChunkPlayer(Agent):
             self._record_timing(answer)
         self._tick = 0
         return info
-
-    @property
-    def reads_slo(self) -> bool:
-        """Whether the policy's server reads an SLO at a reset."""
-        reads = ability(self._agent, ReadsSlo)
-        return reads is not None and reads.reads_slo
 
     def interrupt(self) -> None:
         """Drop the plan after the robot was stopped or moved, and did not execute the last action

@@ -57,7 +57,6 @@ from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.terminal import typed_keys
 from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.signals import END_SIGNALS, ended_by_signals
-from vlagents_ray.slo import SHARE, Slo
 from vlagents_ray.viewers import open_viewer
 
 logger = logging.getLogger(__name__)
@@ -222,7 +221,6 @@ def _run(options: argparse.Namespace) -> LoopReport:
             viewer=viewer,
             real_time=options.real_time,
             report=report,
-            slo=Slo(hz, age_ms=options.slo_age_ms, share=options.slo_share),
         )
         try:
             run_loop(
@@ -450,13 +448,10 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
 
 
 def _say_timeliness(report: LoopReport, say: Callable[[str], None]) -> None:
-    """Print the share of ticks in time, the ages of actions, and the server's answer to the SLO."""
+    """Print the share of ticks in time, and the ages of actions."""
     time_share = report.timeliness.time_share
-    if not time_share.ticks:
-        return
-    say(in_words(time_share))
-    if not report.slo.get("in_time", True):
-        say(f"the server foresaw that this robot is not served in time: {report.slo['reason']}")
+    if time_share.ticks:
+        say(in_words(time_share))
 
 
 def _after_silence(source: str, control: RobotControl, *, has_terminal: bool) -> str:
@@ -872,18 +867,4 @@ def _add_server_options(options: _Options) -> None:
         default=10.0,
         metavar="S",
         help="Timeout of a request in seconds.",
-    )
-    options.robot(
-        "--slo-age-ms",
-        type=seconds,
-        metavar="MS",
-        help="Largest useful age of an executed action, in ms. Before the first motion, the server "
-        "reports whether it can keep this limit.",
-    )
-    options.robot(
-        "--slo-share",
-        type=number(above=True, maximum=1),
-        default=SHARE,
-        metavar="SHARE",
-        help="Share of the ticks that need an action within --slo-age-ms.",
     )

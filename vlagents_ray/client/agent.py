@@ -342,11 +342,6 @@ class RemoteAgent(Agent):
         rows = (self.metadata or {}).get("longest_prefix")
         return rows if type(rows) is int and rows > 0 else 0
 
-    @property
-    def reads_slo(self) -> bool:
-        """Whether the server accepts an SLO in a reset; see `ReadsSlo`."""
-        return bool((self.metadata or {}).get("reads_slo"))
-
     def close(self) -> None:
         """End the session. A later `reset` begins a new session."""
         self._connection.end_session(self._session, self._session.id)

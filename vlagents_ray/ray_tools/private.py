@@ -125,14 +125,6 @@ USES = (
         (f"{_ROUTER}._choose_replica_for_request",),
         is_required=False,
     ),
-    Use(
-        "autoscaling notices a change of the load up to 10 s later",
-        (
-            "ray.serve._private.replica.ReplicaMetricsManager._add_autoscaling_metrics_point_async",
-            "ray.serve._private.replica.ReplicaMetricsManager._push_autoscaling_metrics",
-        ),
-        is_required=False,
-    ),
 )
 
 
@@ -581,28 +573,6 @@ def check_replica() -> None:
             "that is stopped would drop its sessions; install a version that was tried: pip "
             f"install '{requirement()}'"
         ) from error
-
-
-def report_to_autoscaling() -> None:
-    """Make the replica of this process report its load to Serve's controller now.
-
-    Any thread may call this function. Serve itself has one task that records the load and another
-    task that reports the recorded load. Both have the same period, so that a change may arrive
-    after two periods. Without autoscaling, the function does nothing.
-    """
-    worker = _worker()
-    replica = worker.actors.get(worker.actor_id)._replica_impl
-    manager = replica._metrics_manager
-    if getattr(manager, "_autoscaling_config", None) is None:
-        return
-
-    async def report() -> None:
-        await manager._add_autoscaling_metrics_point_async()
-        manager._push_autoscaling_metrics()
-
-    import asyncio
-
-    asyncio.run_coroutine_threadsafe(report(), replica._event_loop)
 
 
 def replica_is_initialized(replica: Any) -> Any:

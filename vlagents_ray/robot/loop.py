@@ -26,7 +26,6 @@ from vlagents_ray.abilities import (
     HasControl,
     HasStatistics,
     Interruptible,
-    ReadsSlo,
     ability,
 )
 from vlagents_ray.chunking.control import RobotControl
@@ -43,7 +42,6 @@ from vlagents_ray.interface import (
     PLANNED,
     SAFE,
     SILENT,
-    SLO,
     WANTED,
     Act,
     Agent,
@@ -59,7 +57,6 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.settings import require_arguments
 from vlagents_ray.signals import END_SIGNALS, ended_by_signals, raise_dropped
-from vlagents_ray.slo import Slo, read_answer
 from vlagents_ray.viewers import EpisodeViewer, LoopView
 
 Restart = Literal["manual", "auto"]
@@ -376,9 +373,6 @@ class LoopReport:
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
     outcome: str = ""  # "success" or "failure", if the episode was marked on the live page
     timeliness: Timeliness = field(default_factory=Timeliness)
-    # The server's answer to the SLO of the run: `load`, `in_time`, `reason`; empty if there was no
-    # answer.
-    slo: dict[str, Any] = field(default_factory=dict)
 
     @property
     def safe_ticks(self) -> int:
@@ -461,8 +455,6 @@ class LoopOptions:
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         report: A new report, which the caller can read even if the loop ends with an exception; by
             default the loop makes a report.
-        slo: The service level objective that is sent with the reset; the server reports whether it
-            can meet it. By default it contains only the rate of the loop.
 
     Raises:
         ConfigError: `restart` has a wrong value.
@@ -476,7 +468,6 @@ class LoopOptions:
     viewer: EpisodeViewer | None = None
     real_time: bool = False
     report: LoopReport | None = None
-    slo: Slo | None = None
 
     def __post_init__(self) -> None:
         if self.restart is not None and self.restart not in get_args(Restart):
@@ -592,20 +583,11 @@ def run_loop(
         try:
             obs = _observed(robot)
             fit.require(obs, None)
-            reset_options = dict(options.reset_options)
-            reads = ability(agent, ReadsSlo)
-            if reads is not None and reads.reads_slo:
-                reset_options[SLO] = (options.slo or Slo(hz)).to_json()
-            reset_info = agent.reset(obs, instruction, **reset_options)
+            agent.reset(obs, instruction, **options.reset_options)
             counts_ticks = ability(agent, CountsTicks)
             if counts_ticks is not None:
                 report.timeliness = counts_ticks.timeliness
                 run.agent_counts_ticks = True
-            # A policy in this process may return values of any type.
-            told: object = reset_info.get(SLO) if isinstance(reset_info, dict) else None
-            report.slo = read_answer(told)
-            if not report.slo.get("in_time", True):
-                logger.warning("slo: %s", report.slo["reason"])
 
             if recorder is not None:
                 stack.enter_context(recorder.episode(instruction or ""))

@@ -13,16 +13,14 @@ import math
 import reprlib
 import threading
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.interface import EXECUTED_AGE, TICKS
-from vlagents_ray.protocol.messages import Priority
-from vlagents_ray.slo import SHARE
 
-WINDOW_S = 10  # time over which shares, ages and the goodput are computed, s
+WINDOW_S = 10  # time over which shares and ages are computed, s
 # Maximum number of ticks, and maximum age, in one report. The report of a robot that was offline
 # for weeks stays below these limits, since the robot would otherwise be rejected forever.
 _MOST_TICKS = 2**31
@@ -73,12 +71,8 @@ class RobotReport(NamedTuple):
 class RobotTimes:
     """The ticks and the ages that the robot of one session reports. Thread-safe."""
 
-    def __init__(self, priority: Priority = Priority.ROBOT) -> None:
+    def __init__(self) -> None:
         """Create the record of a session, without reports."""
-        self.priority = priority
-        self.target_share = SHARE  # required share of ticks that have an action in time
-        self.ticks = 0  # total number of ticks
-        self.starved = 0  # total number of starved ticks
         self._lock = threading.Lock()
         # Number, ticks and starved ticks of each second, oldest first.
         self._seconds: deque[tuple[int, int, int]] = deque(maxlen=WINDOW_S + 1)
@@ -89,8 +83,6 @@ class RobotTimes:
         """Add a report that arrived at `now`, s."""
         second = math.floor(now)
         with self._lock:
-            self.ticks += report.ticks
-            self.starved += report.starved
             ticks, starved = report.ticks, report.starved
             if self._seconds and self._seconds[-1][0] >= second:
                 second, ticks_before, starved_before = self._seconds.pop()
@@ -104,12 +96,6 @@ class RobotTimes:
         """Return statistics about the service to the robot in the last `WINDOW_S` seconds before
         `now`, s.
         """
-        with self._lock:
-            ages_ms = [age_ms for when, age_ms in self._ages if when > now - WINDOW_S]
-        return TimeShare.from_ages(*self._ticks_lately(now), ages_ms)
-
-    def _ticks_lately(self, now: float) -> tuple[int, int]:
-        """Return the ticks and the starved ticks in the last `WINDOW_S` seconds before `now`, s."""
         oldest = math.floor(now) - WINDOW_S
         all_ticks = all_starved = 0
         with self._lock:
@@ -117,60 +103,5 @@ class RobotTimes:
                 if second > oldest:
                     all_ticks += ticks
                     all_starved += starved
-        return all_ticks, all_starved
-
-    def is_in_time(self, now: float) -> bool | None:
-        """Return whether the robot's share was at least its target in the last `WINDOW_S` seconds
-        before `now`, s; None if the robot reported no ticks.
-        """
-        # Computing the ages would take ten times as long.
-        share = TimeShare(*self._ticks_lately(now)).share
-        return None if share is None else share >= self.target_share
-
-
-class Goodput(NamedTuple):
-    """The robots that report their ticks."""
-
-    robots: int  # number of robots that reported ticks in the last `WINDOW_S` seconds
-    in_time: int  # number of these robots with a share of at least their target
-
-    @property
-    def late(self) -> int:
-        """Number of robots with a share below their target."""
-        return self.robots - self.in_time
-
-
-def goodput(times: Iterable[RobotTimes], now: float) -> dict[Priority, Goodput]:
-    """Count the robots in time at `now`, s, by the priority of their sessions."""
-    robots = dict.fromkeys(Priority, 0)
-    in_time = dict.fromkeys(Priority, 0)
-    for robot in times:
-        is_in_time = robot.is_in_time(now)
-        if is_in_time is not None:
-            robots[robot.priority] += 1
-            in_time[robot.priority] += is_in_time
-    return {priority: Goodput(robots[priority], in_time[priority]) for priority in Priority}
-
-
-def describe(times: Iterable[RobotTimes], now: float) -> dict[str, Any]:
-    """Return statistics about the service to a replica's robots in the last `WINDOW_S` seconds
-    before `now`, s, for the metadata.
-
-    Returns:
-        `robots`, the number of robots that report their ticks; `in_time`, the number of robots
-        whose share was at least their target; `share`, the share of all robots' ticks that were in
-        time, None without ticks; and `age_p95_ms`, the largest 95th percentile of the ages of one
-        robot's actions.
-    """
-    robots = [robot for robot in times if robot.priority is Priority.ROBOT]
-    lately = [robot.lately(now) for robot in robots]
-    ticks = sum(robot.ticks for robot in lately)
-    starved = sum(robot.starved for robot in lately)
-    ages_ms = [robot.age_p95_ms for robot in lately if robot.age_p95_ms is not None]
-    served = goodput(robots, now)[Priority.ROBOT]
-    return {
-        "robots": served.robots,
-        "in_time": served.in_time,
-        "share": TimeShare(ticks, starved).share,
-        "age_p95_ms": max(ages_ms, default=None),
-    }
+            ages_ms = [age_ms for when, age_ms in self._ages if when > now - WINDOW_S]
+        return TimeShare.from_ages(all_ticks, all_starved, ages_ms)

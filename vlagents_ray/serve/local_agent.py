@@ -17,7 +17,6 @@ from vlagents_ray.ray_tools.git_state import GitState
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
-from vlagents_ray.serve.in_time import describe
 from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
@@ -47,7 +46,6 @@ def build_engine(
         batch_sizes=args.batch.sizes or (),
         session_limit=args.sessions.limit,
         session_idle_s=args.sessions.idle_s,
-        slo=None if args.slo is None else args.slo.objective(),
         version=version_of(args),
         check=args.dialects.require_fit,
         limits=args.limits.call_limits(),
@@ -81,14 +79,10 @@ def policy_metadata(
         "contract": None if contract is None else contract.to_json(),
         "continues_plans": model.continues_plans,
         "longest_prefix": model.longest_prefix,
-        "reads_slo": True,  # selected at a reset
-        "slo": None if args.slo is None else args.slo.objective().to_json(),
         "version": importlib.metadata.version("vlagents-ray"),
         "code": None if code is None else code.to_json(),
         "program": program | model.files,
         "batch_costs": engine.queue.window.describe_costs(),
-        "load": engine.pace.load().load,
-        "robots": describe(engine.sessions.times(), engine.clock()),
     }
 
 

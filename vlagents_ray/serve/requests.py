@@ -35,7 +35,6 @@ from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import DecodedFiles, Priority, Reply, Request
 from vlagents_ray.serve.queue.preparation import Preparation
-from vlagents_ray.slo import Slo
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.access.api_keys import Caller
@@ -91,7 +90,6 @@ class Opening:
     # First step of the connection's previous episode, which continues if the reset is undone; None
     # if there is none.
     previous: int | None
-    slo: Slo | None = None  # SLO of the robot, if its reset or the deployment contains an SLO
 
 
 @dataclass(slots=True, eq=False)

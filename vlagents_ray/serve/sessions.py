@@ -7,7 +7,6 @@ policy, together with that copy.
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections import Counter, OrderedDict
@@ -115,15 +114,12 @@ class Session(Generic[M]):
     began: float = 0.0
     last_reset: float = 0.0  # arrival time of the latest reset, which may still be queued, s
     moves: int = 0  # number of moves between replicas since the last reset
-    # Time at which the session arrived from another replica, s, of the engine's clock; -inf if it
-    # began here.
-    moved_in: float = -math.inf
     # Whether the session was announced to the other replicas, which then keep no older state.
     announced: bool = False
     used: float = field(default_factory=time.monotonic)  # time of the session's last request, s
     # Reports of the session's robot at this replica; None before the first report.
     times: RobotTimes | None = None
-    plan: RobotPlan = field(default_factory=RobotPlan)  # needs of the session's robot
+    plan: RobotPlan = field(default_factory=RobotPlan)  # plan of the robot in this episode
 
     @property
     def version(self) -> Version:
@@ -285,6 +281,7 @@ class SessionTable(Generic[M]):
             session.set_agent(None)
             session.steps = session.first = first
             session.moves = 0
+            session.plan = RobotPlan(began=reset.arrived, heard=reset.arrived)
             session.expected = max(session.expected, first)
             session.began = reset.arrived
             session.last_reset = max(session.last_reset, reset.arrived)
@@ -491,10 +488,6 @@ class SessionTable(Generic[M]):
         """Return the number of sessions by transport."""
         with self._lock:
             return Counter(session.origin.transport for session in self._sessions.values())
-
-    def times(self) -> list[RobotTimes]:
-        """Return the reports of the sessions whose robots report their ticks."""
-        return [session.times for session in self.all() if session.times is not None]
 
     def movable_by_connection(self, within_s: float) -> Counter[str]:
         """Return the number of sessions by connection whose clients can be requested to reconnect,

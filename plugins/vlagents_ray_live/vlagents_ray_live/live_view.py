@@ -20,10 +20,8 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError, UnknownSession
 from vlagents_ray.protocol.json_messages import plain_values
-from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES
-from vlagents_ray.serve.in_time import goodput
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
@@ -178,10 +176,8 @@ class ReplicaView:
         waiting = {}
         for priority, depth in engine.queue.depth_by_priority().items():
             waiting[priority.name.lower()] = depth
-        robots = goodput(engine.sessions.times(), engine.clock())[Priority.ROBOT]
         snapshot.document = {
             **self._about,
-            "robots": {"robots": robots.robots, "in_time": robots.in_time},
             **self._state(),
             **_counts(answers),
             "waiting": waiting,

@@ -19,7 +19,7 @@ from starlette.testclient import TestClient
 from websockets.sync.client import connect
 
 from vlagents_ray.images.codecs import JPEG
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import SLACK, Act, Agent, Obs
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_requests
 from vlagents_ray.protocol.messages import MessageLimits, Op, Request
 from vlagents_ray.serve.access.api_keys import NoKey
@@ -28,7 +28,7 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, MetricsBuffer
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.queue.batch_queue import LoadMeter
+from vlagents_ray.serve.queue.batch_queue import LoadMeter, QueueLoad
 
 OBS = Obs({"front": np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)}, 0.5)
 
@@ -184,29 +184,38 @@ def test_a_request_leaves_nothing_to_the_garbage_collector(engine: Engine) -> No
         gc.enable()
 
 
-def test_load_is_the_busy_share_and_the_mean_queue(engine: Engine) -> None:
+def test_the_load_is_the_busy_share_and_the_part_of_it_for_robots_with_slack(
+    engine: Engine,
+) -> None:
     engine.start()
     meter = LoadMeter(engine.queue)
     answered = threading.Semaphore(0)
-    for name in ("a", "b", "c"):
-        submit(engine, name, Request("reset", Obs()), lambda _: answered.release() and None)
-    assert all(answered.acquire(timeout=10) for _ in range(3))
+
+    def begin(name: str, request: Request) -> None:
+        submit(engine, name, request, lambda _: answered.release() and None)
+
+    for name in ("a", "b"):
+        begin(name, Request("reset", Obs()))
+    assert all(answered.acquire(timeout=10) for _ in range(2))
     meter.read()
     time.sleep(0.2)
-    quiet = meter.read()
-    assert quiet.utilisation < 0.2
-    assert quiet.waiting == 0
-    Large.gate.clear()
-    submit(
-        engine, "a", Request("act", Obs(info={"wait": True})), lambda _: answered.release() and None
-    )
-    wait_for(lambda: engine.queue.depth() == 0)  # the call has left the queue and is in a batch
-    for name in ("b", "c"):
-        submit(engine, name, Request("act", Obs()), lambda _: answered.release() and None)
-    meter.read()
-    time.sleep(0.2)
-    loaded = meter.read()
-    Large.gate.set()
-    assert all(answered.acquire(timeout=60) for _ in range(3))
-    assert loaded.utilisation > 0.99
-    assert loaded.waiting == pytest.approx(2.0, rel=0.05)
+    assert meter.read().utilisation < 0.2
+
+    for name, info in (("a", {}), ("b", {SLACK: 500.0})):
+        Large.gate.clear()
+        begin(name, Request("act", Obs(info={"wait": True, **info})))
+        wait_for(lambda: engine.queue.depth() == 0)  # the request is in a batch
+        meter.read()
+        time.sleep(0.2)
+        Large.gate.set()
+        assert answered.acquire(timeout=60)
+        wait_for(lambda: not engine.queue._running)
+        load = meter.read()
+        assert load.utilisation > 0.9
+        assert (load.paced > 0.9) == bool(info)
+
+
+def test_robots_with_slack_need_less_than_they_use() -> None:
+    assert QueueLoad(0.9, paced=0.8).needed(robots_need=0.3) == pytest.approx(0.4)
+    assert QueueLoad(0.5, paced=0.1).needed(robots_need=0.3) == 0.5
+    assert QueueLoad(1.0, paced=1.0).needed(robots_need=1.0) == 1.0

@@ -51,13 +51,6 @@ def application(args: str) -> str:
             application("{policy: noop, replicas: 1, autoscaling: {}}"),
             "expected replicas or autoscaling, got both",
         ),
-        (
-            application("{policy: noop, slo: {hz: 0}}"),
-            r"slo: hz: expected a rate from .* Hz, got 0; give the rate of the control loop",
-        ),
-        (application("{policy: noop, slo: {age_ms: 100}}"), "slo: expected hz, got"),
-        (application("{policy: noop, slo: {hz: 10, shar: 1}}"), "slo: .*did you mean 'share'"),
-        (application("{policy: noop, slo: 10}"), "slo: expected an object such as"),
         ("applications: 3", "applications"),
         (application("{policy: noop}") + "\nproxy_location: Nowhere", "proxy_location"),
         (application("{policy: noop}") + "\nlogging_config: {log_level: 3}", "log_level"),

@@ -158,7 +158,8 @@ def test_the_ticks_of_a_request_behind_a_hung_call_count_once_with_the_answer_th
     engine.notice_hung()
     assert answered(engine, "good", act_with_report()).error is None
     assert engine.stats.collect().ticks == {"robot": 5}
-    assert sorted(times.ticks for times in engine.sessions.times()) == [5, 5]
+    shares = [session.times.lately(engine.clock()) for session in engine.sessions.all()]
+    assert [share.ticks for share in shares] == [5, 5]
 
 
 def test_the_ticks_of_an_act_that_is_checked_twice_count_once(engine: Engine) -> None:
@@ -169,8 +170,8 @@ def test_the_ticks_of_an_act_that_is_checked_twice_count_once(engine: Engine) ->
     act.reserved = engine.intake.reserve(act)
     engine.intake.retry(act)
     assert replies.get(timeout=10).error is None
-    [times] = engine.sessions.times()
-    assert (times.ticks, times.starved) == (5, 2)
+    [session] = engine.sessions.all()
+    assert session.times.lately(engine.clock())[:2] == (5, 2)
 
 
 OPS = ["reset", "act", "observe", "export"]

@@ -236,36 +236,15 @@ def test_the_time_spent_waiting_for_requests_counts_as_idle() -> None:
     quiet.poller.close()
 
 
-def test_each_request_counts_while_it_waits(queue: Callable[[int], BatchQueue]) -> None:
-    waiting = queue(1)
-    for change, before, after in (
-        (lambda: put(waiting, "first"), 0, 1),
-        (lambda: put(waiting, "second"), 1, 2),
-        (waiting.take, 2, 1),
-        (waiting.take, 1, 0),
-        (lambda: None, 0, 0),
-    ):
-        began = time.perf_counter()
-        _, waited_before_s = waiting.load_s()
-        change()
-        time.sleep(0.02)
-        _, waited_s = waiting.load_s()
-        elapsed_s = time.perf_counter() - began
-        grown_s = waited_s - waited_before_s
-        assert 0.999 * after * 0.02 <= grown_s <= 1.001 * max(before, after) * elapsed_s
-
-
 def behind(session: str, *, arrived: float = 0.0) -> PendingRequest:
-    """Return the request of a robot that is about to run out of rows, but was not admitted because
-    it arrived too late.
-    """
+    """Return the request of a robot that is about to run out of rows, but waits behind others."""
     request = ticket(session, priority=Priority.ROBOT, arrived=arrived)
     request.needed = arrived
     request.waits_behind_others = True
     return request
 
 
-def test_robots_that_are_not_admitted_wait_behind_all_others() -> None:
+def test_robots_of_the_newest_episodes_wait_behind_all_others() -> None:
     waiting = FairQueue()
     waiting.costs_s = (0.0, 0.05, 0.06)
     patient = ticket("patient", priority=Priority.ROBOT)

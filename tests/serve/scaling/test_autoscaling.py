@@ -13,15 +13,7 @@ from ray.serve._private.common import DeploymentID, ReplicaID
 from ray.serve.config import AutoscalingConfig, AutoscalingContext
 
 from vlagents_ray.serve.config.deployment import AutoscalingArgs, ServerArgs
-from vlagents_ray.serve.scaling.autoscaling import (
-    MOVED_LOAD,
-    SESSIONS,
-    SLO_LOAD,
-    SLO_ROBOTS,
-    UTILISATION,
-    WAITING,
-    MeasuredLoad,
-)
+from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, MeasuredLoad
 
 POLICY = DeploymentID("Policy", "app")
 
@@ -29,19 +21,15 @@ POLICY = DeploymentID("Policy", "app")
 def context_of(
     utilisation: list[float],
     *,
-    waiting: float = 0.0,
     sessions: float = 0.0,
     target: int | None = None,
     running: int | None = None,
     requests: float = 0.0,
-    slo_load: float = 0.0,
-    moved_load: float = 0.0,
-    slo_robots: float = 0.0,
     now: float = 0.0,
     state: dict[str, Any] | None = None,
 ) -> AutoscalingContext:
     """Return the context that Serve passes to the policy. Each reporting replica has its entry of
-    `utilisation`, and the same queue and number of sessions.
+    `utilisation`, and the same number of sessions.
     """
     replicas = [ReplicaID(str(i), POLICY) for i in range(len(utilisation))]
     return AutoscalingContext(
@@ -55,11 +43,7 @@ def context_of(
         total_queued_requests=0.0,
         aggregated_metrics={
             UTILISATION: dict(zip(replicas, utilisation, strict=True)),
-            WAITING: dict.fromkeys(replicas, waiting),
             SESSIONS: dict.fromkeys(replicas, sessions),
-            SLO_LOAD: dict.fromkeys(replicas, slo_load),
-            MOVED_LOAD: dict.fromkeys(replicas, moved_load),
-            SLO_ROBOTS: dict.fromkeys(replicas, slo_robots),
         }
         if replicas
         else {},
@@ -88,72 +72,26 @@ def test_busy_replicas_get_help_and_idle_ones_leave() -> None:
     assert requested(policy, [0.1, 0.1, 0.1], sessions=1) == 1
 
 
-def test_a_long_queue_counts_where_the_policy_is_busy_anyway() -> None:
-    assert requested(MeasuredLoad(), [1.0], waiting=3.0) == 3
-    assert requested(MeasuredLoad(target_waiting=3.0), [1.0], waiting=3.0) == 2
-
-
 def test_sessions_count_only_if_a_target_is_set() -> None:
     assert requested(MeasuredLoad(), [0.1], sessions=100, target=1) == 1
     assert requested(MeasuredLoad(target_sessions=32), [0.1], sessions=100) == 4
 
 
-def test_robots_that_state_their_needs_get_the_replicas_for_them() -> None:
-    """Such robots keep replicas busy however few they are, so utilisation says nothing about their
-    needs.
-    """
-    policy = MeasuredLoad()
-    assert requested(policy, [1.0], sessions=4, slo_robots=4, slo_load=0.6) == 1
-    assert requested(policy, [1.0], sessions=16, slo_robots=16, slo_load=2.1) == 3
-    assert requested(policy, [1.0], sessions=2, slo_robots=2, slo_load=9.0) == 2
-    assert (
-        requested(MeasuredLoad(target_slo_load=0.5), [1.0], sessions=4, slo_robots=4, slo_load=0.6)
-        == 2
-    )
+def test_utilisation_waits_for_its_delay_and_sessions_do_not() -> None:
+    policy, state = MeasuredLoad(target_sessions=8, busy_s=7.0), {}
 
-
-def test_sessions_that_state_no_needs_count_by_utilisation_as_well() -> None:
-    assert requested(MeasuredLoad(), [1.0], sessions=5, slo_robots=4, slo_load=0.6) == 2
-
-
-def test_measured_load_waits_for_its_delay_and_robots_with_slos_do_not() -> None:
-    policy, state = MeasuredLoad(busy_s=7.0), {}
-    busy: dict[str, Any] = {"utilisation": [1.0], "sessions": 5.0}
-
-    def at(now: float, **load: Any) -> int:
+    def at(now: float, utilisation: float, sessions: float = 5.0) -> int:
         nonlocal state
-        number, state = policy(context_of(now=now, state=state, **load))
+        number, state = policy(context_of([utilisation], sessions=sessions, now=now, state=state))
         return number
 
-    assert at(100.0, **busy) == 1
-    assert at(106.9, **busy) == 1
-    assert at(107.0, **busy) == 2
-    assert at(108.0, utilisation=[0.1], sessions=5.0) == 1, "a break"
-    assert at(109.0, **busy) == 1
-    assert at(110.0, **busy, slo_robots=4, slo_load=2.1) == 3, "one robot declares no needs"
-    assert at(116.0, **busy) == 2
-
-
-def test_sessions_wait_until_all_replicas_have_reported() -> None:
-    policy = MeasuredLoad(target_sessions=8, crowded_s=2.0)
-    number, state = policy(context_of([0.1], sessions=9.0, now=10.0))
-    assert number == 1
-    number, state = policy(context_of([0.1], sessions=9.0, now=11.9, state=state))
-    assert number == 1
-    number, _ = policy(context_of([0.1], sessions=9.0, now=12.0, state=state))
-    assert number == 2
-
-
-def test_robots_that_have_just_moved_request_no_replica_and_keep_theirs() -> None:
-    """Two replicas count a robot while it moves, and until Serve has noticed that its replica was
-    killed.
-    """
-    robots: dict[str, Any] = {"sessions": 8.0, "slo_robots": 8.0, "slo_load": 0.8}
-    assert requested(MeasuredLoad(), [1.0, 1.0], **robots, moved_load=0.3) == 2
-    assert requested(MeasuredLoad(), [1.0, 1.0], **robots) == 2
-    robots["slo_load"] = 1.0
-    assert requested(MeasuredLoad(), [1.0, 1.0], **robots) == 3
-    assert requested(MeasuredLoad(), [1.0, 1.0], **robots, moved_load=0.3) == 2
+    assert at(100.0, 1.0) == 1
+    assert at(106.9, 1.0) == 1
+    assert at(107.0, 1.0) == 2
+    assert at(108.0, 0.1) == 1, "a break"
+    assert at(109.0, 1.0) == 1
+    assert at(110.0, 1.0, sessions=17) == 3
+    assert at(116.0, 1.0) == 2
 
 
 def test_around_a_target_the_number_stays() -> None:
@@ -196,12 +134,12 @@ def test_settings_reach_serve() -> None:
         max_replicas=3, target_sessions=8, look_back_s=5, upscale_delay_s=2, downscale_delay_s=4
     )
     config = AutoscalingConfig(**args.options())
-    assert (config.max_replicas, config.upscale_delay_s, config.downscale_delay_s) == (3, 1, 4)
-    delays = {name: config.policy.policy_kwargs[name] for name in ("busy_s", "crowded_s")}
-    assert delays == {"busy_s": 1.0, "crowded_s": 0.5}
+    # Sessions are added when all replicas have reported, after one and a half intervals.
+    assert (config.max_replicas, config.upscale_delay_s, config.downscale_delay_s) == (3, 1.5, 4)
+    assert config.policy.policy_kwargs["busy_s"] == 0.5
     assert (config.look_back_period_s, config.metrics_interval_s) == (5, 1)
     policy: Any = config.policy.get_policy()(**config.policy.policy_kwargs)
-    assert requested(policy, [0.1], slo_load=1.2, slo_robots=9, sessions=9) == 2
+    assert requested(policy, [0.1], sessions=9) == 2
 
 
 @pytest.mark.parametrize(

@@ -23,9 +23,7 @@ from vlagents_ray.serve.scaling.rebalancer import (
     ReplicaLoad,
     choose_connections,
     choose_replica,
-    excess_load,
     excess_sessions,
-    mean_sessions,
 )
 from vlagents_ray.serve.sessions import DrainList
 
@@ -63,39 +61,6 @@ def test_a_client_that_reaches_one_machine_only_is_sent_nowhere_else() -> None:
     )
 
 
-def test_a_new_session_goes_to_the_replica_whose_robots_need_least() -> None:
-    """Ten robots with chunks of 50 rows need less capacity than eight robots with chunks of
-    8 rows.
-    """
-    long_chunks = replace(load("a", 10), robots=10, load=0.02)
-    short_chunks = replace(load("b", 8), robots=8, load=0.15)
-    assert chosen([long_chunks, short_chunks]) == "a"
-    assert mean_sessions([long_chunks, short_chunks]) == pytest.approx([2.118, 15.882], abs=1e-3)
-
-
-def test_sessions_whose_needs_are_unknown_count_as_the_mean_robot() -> None:
-    known = replace(load("a", 4), robots=4, load=0.4)
-    half_known = replace(load("b", 4), robots=2, load=0.2)
-    no_costs_yet = replace(load("c", 3), robots=3, load=0.0)
-    loads = [known, half_known, no_costs_yet, load("d", 5)]
-    assert mean_sessions(loads) == [4.0, 4.0, 3.0, 5.0]
-    assert mean_sessions([load("a", 3), load("b", 0)]) == [3.0, 0.0]
-    assert mean_sessions([]) == []
-
-
-def test_clients_that_come_at_once_go_where_robots_need_least() -> None:
-    """Until a robot declares its needs, it counts as an average robot."""
-    loads = [
-        replace(load("a", 10), robots=10, load=0.1),
-        replace(load("b", 10), robots=10, load=0.3),
-    ]
-    for _ in range(10):
-        replica = choose_replica(loads, ClientLocation())
-        assert replica is not None
-        replica.sessions += 1
-    assert [load.sessions for load in loads] == [20, 10]
-
-
 @pytest.mark.parametrize(
     ("mine", "others", "leaving", "expected"),
     [
@@ -122,37 +87,6 @@ def test_moving_the_surplus_never_makes_another_one() -> None:
             moved = excess_sessions(mine, [other])
             assert excess_sessions(mine - moved, [other + moved]) == 0
             assert excess_sessions(other + moved, [mine - moved]) == 0
-
-
-def test_robots_that_need_much_move_although_the_numbers_are_equal() -> None:
-    fast = replace(load("a", 4), robots=4, load=1.2)
-    slow = replace(load("b", 4), robots=4, load=0.2)
-    assert fast.needs_are_known
-    assert excess_load(fast, [slow]) == pytest.approx(0.5)
-    assert excess_load(fast, [slow], leaving=0.3) == 0.0  # one robot is already moving
-    assert excess_load(slow, [fast]) == 0.0
-    alone = replace(load("a", 1), robots=1, load=0.9)
-    assert excess_load(alone, [replace(load("b", 0))]) == 0.0, "a single robot cannot be divided"
-
-
-def test_needs_are_known_only_if_those_of_all_sessions_are() -> None:
-    assert load("a", 0).needs_are_known
-    assert not replace(load("a", 4), robots=3, load=0.5).needs_are_known
-    assert not replace(load("a", 4), robots=4, load=0.0).needs_are_known, (
-        "the costs of the policy are unknown"
-    )
-
-
-def test_moving_load_never_makes_another_surplus() -> None:
-    """Equal robots are distributed like equal sessions."""
-    for mine in range(2, 40):
-        for other in range(mine + 1):
-            pair = [
-                replace(load(name, robots), robots=robots, load=0.1 * robots)
-                for name, robots in (("a", mine), ("b", other))
-            ]
-            moved = int(excess_load(pair[0], pair[1:]) / 0.1 + 1e-6)
-            assert moved == excess_sessions(mine, [other])
 
 
 def test_connections_move_whole() -> None:

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from vlagents_ray.bounds import MOST_BYTES, MOST_CPUS, MOST_ROWS, MOST_S, MOST_WORKERS
-from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.program import Program, loaded_code
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.ray_tools.git_state import GitState, code_of
@@ -19,7 +18,6 @@ from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.config.parts import PartArgs
 from vlagents_ray.serve.queue.call_limits import CallLimits
-from vlagents_ray.slo import MOST, SHARE, Slo
 
 POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
 
@@ -136,45 +134,6 @@ class SessionArgs(_DeploymentModel):
         le=MOST_S,
         description="Time without a request after which a session ends, in seconds.",
     )
-
-
-class SloArgs(_DeploymentModel):
-    """The needs of robots that declare none at their reset, see `vlagents_ray.slo.Slo`."""
-
-    hz: float = Field(
-        le=MOST,
-        description="Number of ticks of the robot's control loop per second.",
-    )
-    age_ms: float | None = Field(
-        default=None,
-        le=MOST,
-        description="Largest age of an executed action, in ms. null: any.",
-    )
-    share: float = Field(
-        default=SHARE,
-        le=1,
-        description="Smallest share of the robot's ticks that have an action in time.",
-    )
-    rows: int | None = Field(
-        default=None,
-        le=int(MOST),
-        description="Largest number of rows of a chunk that the robot executes. null: all.",
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _as_at_a_reset(cls, value: object) -> object:
-        if not isinstance(value, cls):
-            try:
-                Slo.from_json(value)
-            except ConfigError as error:
-                # pydantic's message begins with the path of the setting, which ends with `slo`.
-                raise ValueError(str(error).removeprefix("slo.").removeprefix("slo: ")) from None
-        return value
-
-    def objective(self) -> Slo:
-        """Return the SLO."""
-        return Slo(**self.model_dump())
 
 
 class StreamArgs(_DeploymentModel):
@@ -344,9 +303,6 @@ class AccessArgs(_DeploymentModel):
         return None if self.insecure else load_keys(self.keys_file)
 
 
-_NEEDS_S = 1.0  # time for which robots must need more replicas according to their SLOs, s
-
-
 class AutoscalingArgs(_DeploymentModel):
     """The settings of autoscaling, which derives the number of replicas from the load over all
     transports, see `vlagents_ray.serve.scaling.autoscaling`.
@@ -369,28 +325,15 @@ class AutoscalingArgs(_DeploymentModel):
         default=0.7,
         gt=0,
         le=1,
-        description="Share of the time in which a replica's policy may be busy. The remaining "
-        "time absorbs bursts.",
-    )
-    target_waiting: float = Field(
-        default=1.0,
-        gt=0,
-        le=1_000_000,
-        description="Mean number of requests in a replica's queue, in batches of the largest size.",
+        description="Share of the time for which clients may need a replica's policy. The "
+        "remaining time absorbs bursts.",
     )
     target_sessions: float | None = Field(
         default=None,
         gt=0,
         le=1_000_000,
-        description="Number of sessions of a replica, for policies that keep much memory for each. "
-        "null: any.",
-    )
-    target_slo_load: float = Field(
-        default=0.8,
-        gt=0,
-        le=1,
-        description="Share of a replica that its robots may need to be in time, according to "
-        "their SLOs.",
+        description="Number of sessions of a replica, for policies that keep much memory for each, "
+        "or compute elsewhere. null: any.",
     )
     look_back_s: float = Field(
         default=15.0,
@@ -403,8 +346,7 @@ class AutoscalingArgs(_DeploymentModel):
         ge=0,
         le=MOST_S,
         description="Time for which more replicas must be needed before they are added, in "
-        "seconds. Replicas needed for sessions are added after at most 3 s, those needed for "
-        "SLOs after at most 1 s.",
+        "seconds. Replicas needed for sessions are added after at most 3 s.",
     )
     downscale_delay_s: float = Field(
         default=300.0,
@@ -424,26 +366,17 @@ class AutoscalingArgs(_DeploymentModel):
 
     def options(self) -> dict[str, Any]:
         """Return Serve's `autoscaling_config`."""
-        targets = {
-            "target_utilisation",
-            "target_waiting",
-            "target_sessions",
-            "target_slo_load",
-        }
+        targets = {"target_utilisation", "target_sessions"}
         # Interval of the reports of a replica, s. Serve's default is 10 s.
         report_s = min(2.0, self.look_back_s / 5)
-        # The needs of robots are known, and reported as soon as they change. The first measured
-        # costs of batches become more accurate within a second.
-        needs_s = min(self.upscale_delay_s, _NEEDS_S)
         # While a session moves, two replicas may count the session until both have reported again.
         all_reported_s = min(self.upscale_delay_s, 1.5 * report_s)
         kwargs = self.model_dump(include=targets) | {
-            "busy_s": self.upscale_delay_s - needs_s,
-            "crowded_s": max(0.0, all_reported_s - needs_s),
+            "busy_s": self.upscale_delay_s - all_reported_s
         }
         return {
             **self.model_dump(exclude_none=True, exclude=targets | {"look_back_s"}),
-            "upscale_delay_s": needs_s,
+            "upscale_delay_s": all_reported_s,
             "look_back_period_s": self.look_back_s,
             "metrics_interval_s": report_s,
             "policy": {
@@ -513,10 +446,6 @@ class ServerArgs(_DeploymentModel):
     sessions: SessionArgs = Field(
         default=SessionArgs(),
         description="Sessions of one replica.",
-    )
-    slo: SloArgs | None = Field(
-        default=None,
-        description="Needs of robots that declare none at their reset.",
     )
     limits: LimitArgs = Field(
         default=LimitArgs(),

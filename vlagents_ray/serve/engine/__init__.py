@@ -33,14 +33,14 @@ Session.agent, .prepares, .model, .steps, .instruction, .announced
     protection: one writer
 
 Session.plan
-    writers: policy, at resets and answers; .is_admitted also each reader of the load
+    writers: policy, at resets and answers
     protection: single assignments; a reader gets the old or the new value
 
 Session.first, .expected, .began, .last_reset, .moves, .over
     writers: each thread that reserves, runs or undoes a reset
     protection: lock of SessionTable
 
-Session.origin, .used, .moved_in
+Session.origin, .used
     writers: each thread that reserves for a request of the session
     protection: the last value counts: requests of two threads have no order
 

@@ -15,14 +15,13 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from vlagents_ray.errors import (
-    ConfigError,
     InvalidInput,
     NotReset,
     PolicyUnavailable,
     UnknownSession,
     VLAgentsError,
 )
-from vlagents_ray.interface import SLO, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import (
     BACKGROUND_OPS,
     IMMEDIATE_OPS,
@@ -41,7 +40,6 @@ from vlagents_ray.serve.queue.replica_pace import stated_slack_s
 from vlagents_ray.serve.requests import Opening, Origin, PendingRequest, ReservedAct
 from vlagents_ray.serve.sessions import Session, SessionState
 from vlagents_ray.serve.weights import follows
-from vlagents_ray.slo import Slo
 
 # Operations after which a connection does not have the request's session.
 _USE_NO_SESSION = ("close", *BACKGROUND_OPS)
@@ -76,7 +74,6 @@ class Intake:
         self._drain_list = parts.drain_list
         self._stats = parts.stats
         self._clock = parts.clock
-        self._default_slo = parts.settings.slo
         # None if the engine has no threads.
         self._preparations = Preparations() if parts.settings.threaded else None
 
@@ -187,7 +184,7 @@ class Intake:
             if request.obs is not None and request.obs.info:
                 self._record_report(session, pending, request.obs.info)
             session.plan.heard = pending.arrived
-            pending.waits_behind_others = session.plan.is_admitted is False
+            pending.waits_behind_others = session.plan.waits_behind_others
             if preparation is None and self._queue.window.overlaps:
                 preparation = self._prepare(session, request.obs)
             return ReservedAct(session, model, episode, preparation)
@@ -213,8 +210,6 @@ class Intake:
         times = session.times
         if times is None:
             times = session.times = RobotTimes()
-        times.priority = pending.priority
-        times.target_share = session.plan.share
         pending.message.reports[pending.index] = ReceivedReport(
             report, times, pending.priority.name.lower(), self._stats, self._clock
         )
@@ -223,19 +218,12 @@ class Intake:
         """Check a reset, and reserve an episode of its session."""
         request, origin, session_id = pending.request, pending.origin, pending.session_id
         kwargs = dict(request.kwargs)
-        slo = _stated_slo(kwargs.pop(SLO, None))
-        if slo is None and pending.priority is Priority.ROBOT:
-            slo = self._default_slo
         follows_newest = follows(kwargs, by_default=pending.priority is not Priority.ROBOT)
         self._model.require_loaded().check(request)
 
-        is_new = session_id not in self._sessions
         session = self._sessions.open(session_id, origin)
-        if is_new and request.step is not None:
-            # The client has had an episode at another replica, so it resumes a lost session.
-            session.moved_in = self._clock()
         first, previous = self._sessions.begin(session, request.step, pending.arrived, origin)
-        return Opening(kwargs, follows_newest, first, previous, slo)
+        return Opening(kwargs, follows_newest, first, previous)
 
     def withdraw(self, *requests: PendingRequest) -> None:
         """End requests without an answer, as `BatchQueue.withdraw` does, and undo resets that
@@ -357,16 +345,6 @@ def _take_stored(session: Session[LoadedModel], pending: PendingRequest) -> Prep
     obs, preparation = stored
     pending.request = replace(pending.request, obs=obs)
     return preparation
-
-
-def _stated_slo(option: object) -> Slo | None:
-    """Return the SLO in a reset, or None; raise `InvalidInput` if the SLO is invalid."""
-    if option is None:
-        return None
-    try:
-        return Slo.from_json(option)
-    except ConfigError as error:
-        raise InvalidInput(str(error)) from error
 
 
 def _latest_episode(pending: PendingRequest, session: Session[LoadedModel]) -> int:

@@ -88,10 +88,9 @@ class SessionMoves:
             began=began,
             last_reset=began,
             moves=moves,
-            moved_in=self._clock(),
             announced=True,
             origin=origin,
-            plan=RobotPlan.from_list(state.robot, origin.prefix, began + state.age_s),
+            plan=RobotPlan.from_list(state.robot, began, began + state.age_s),
         )
         self._sessions.expect(arriving)
         try:

@@ -23,7 +23,7 @@ from vlagents_ray.errors import (
     UnknownSession,
     VLAgentsError,
 )
-from vlagents_ray.interface import REPLAN, SLO, Act
+from vlagents_ray.interface import REPLAN, Act
 from vlagents_ray.protocol.messages import Priority, Reply
 from vlagents_ray.serve.engine.ability_call import AbilityCall
 from vlagents_ray.serve.engine.intake import Intake
@@ -38,7 +38,6 @@ from vlagents_ray.serve.engine.responses import (
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.queue.batch_queue import Taken
 from vlagents_ray.serve.queue.preparation import Preparations
-from vlagents_ray.serve.queue.replica_pace import RobotPlan, need_of
 from vlagents_ray.serve.requests import Answer, Opening, PendingRequest, ReservedAct, deliver
 from vlagents_ray.serve.sessions import Session, SessionState
 from vlagents_ray.serve.weights import WeightsVersion
@@ -286,15 +285,6 @@ class Runner:
                     observes.observe(obs)
 
         info = {**model.identity, **info}
-        key = pending.origin.prefix
-        plan = RobotPlan()
-        if opening.slo is not None:
-            rows = 1 if model.contract is None else model.contract.chunk or 1
-            info[SLO] = self._pace.check(need_of(opening.slo, rows), key)
-            plan = RobotPlan.from_slo(opening.slo, rows)
-            plan.is_admitted = info[SLO]["in_time"]
-        plan.key, plan.heard = key, pending.arrived
-        session.plan = plan
         spent = timing(pending, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.set_agent(agent)

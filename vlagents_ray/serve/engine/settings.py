@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from vlagents_ray.contract import Contract
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, REPLY_BYTES
 from vlagents_ray.serve.queue.call_limits import CallLimits
-from vlagents_ray.slo import Slo
 
 
 def accept_any(_: Contract | None) -> None:
@@ -26,7 +25,6 @@ class EngineSettings:
     batch_sizes: Sequence[int] = ()
     session_limit: int = 1000  # maximum number of sessions
     session_idle_s: float = 600.0  # time without a request after which a session may be dropped, s
-    slo: Slo | None = None  # need of a robot whose reset contains no SLO
     # Version of the policy; sessions only move between replicas of equal version and settings.
     version: str = ""
     # Function that raises an error if a policy with a given contract cannot be served.

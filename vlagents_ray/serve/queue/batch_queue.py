@@ -112,7 +112,6 @@ class BatchQueue:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             for pending in requests:
-                self._load_timer.count(self._waiting.size, pending.arrived)
                 if self.window.slow:
                     self.window.record_arrival(pending)
                 self._waiting.add(pending)
@@ -162,7 +161,6 @@ class BatchQueue:
             now = self._clock()
             self._asleep = self._driven
             self._interrupted = False
-            self._load_timer.count(self._waiting.size, now)
             if self._closed:
                 return None
             batch, expired = self._waiting.take(self.largest, now, self.most_with_others)
@@ -190,9 +188,11 @@ class BatchQueue:
     def end(self) -> None:
         """Record that the batch has ended."""
         ended = self._clock()
+        duration = ended - self._begun
         with self._lock:
+            self._load_timer.count_batch(self._running, duration)
             self._running = ()  # the observations in the batch may be in the sender's memory
-            self.window.record_end(ended, ended - self._begun)
+            self.window.record_end(ended, duration)
             self._waiting.costs_s = self.window.costs_s
         self.poller.reclaim()
 
@@ -204,7 +204,6 @@ class BatchQueue:
         the batch hangs.
         """
         with self._lock:
-            self._load_timer.count(self._waiting.size, self._clock())
             if self._running:
                 self.poller.hand_to_reader()
             return self._running, self._waiting.clear()
@@ -228,11 +227,10 @@ class BatchQueue:
         return dict(zip(Priority, self._waiting.depth, strict=True))
 
     def load_s(self) -> tuple[float, float]:
-        """Return the total idle time of the policy's thread, and the total waiting time of all
-        requests so far, s. The growth rate of the waiting time is the mean queue length.
+        """Return the total idle time of the policy's thread so far, and the total time in which it
+        computed for robots with slack, s.
         """
-        with self._lock:
-            return self._load_timer.idle_time_s(), self._load_timer.waited_s(self._waiting.size)
+        return self._load_timer.idle_time_s(), self._load_timer.paced_s
 
     def close(self) -> list[PendingRequest]:
         """Reject further requests, make `next` return None after the running batch, and return
@@ -240,7 +238,6 @@ class BatchQueue:
         """
         with self._lock:
             self._closed = True
-            self._load_timer.count(self._waiting.size, self._clock())
             self._wait_over.set()
             self._wake()
             return self._waiting.clear()
@@ -306,32 +303,23 @@ class BatchQueue:
 
 
 class LoadTimer:
-    """Adds up the waiting time of requests and the idle time of the policy's thread, which is idle
-    at first.
-
-    Callers of `count` and `waited_s` must hold a common lock; `idle_time_s` may be called on any
-    thread.
+    """Adds up the idle time of the policy's thread, which is idle at first, and the time in which
+    it computes for robots with slack. `idle_time_s` may be called on any thread.
     """
 
     def __init__(self) -> None:
-        now = time.perf_counter()
-        self._waited = 0.0  # total waiting time of all requests, s
-        self._counted = now  # time up to which `_waited` is complete
         # Total idle time, s, and start of the current idle period.
-        self._idle: tuple[float, float | None] = (0.0, now)
+        self._idle: tuple[float, float | None] = (0.0, time.perf_counter())
+        self.paced_s = 0.0  # total time in which the policy computed for robots with slack, s
 
-    def count(self, waiting: int, now: float) -> None:
-        """Add the time that `waiting` requests have waited until `now`, s, before their number
-        changes.
-        """
-        self._waited += waiting * (now - self._counted)
-        self._counted = now
-
-    def waited_s(self, waiting: int) -> float:
-        """Return the total waiting time of all requests, s, including the `waiting` requests that
-        wait now.
-        """
-        return self._waited + waiting * max(0.0, time.perf_counter() - self._counted)
+    def count_batch(self, batch: Sequence[PendingRequest], duration: float) -> None:
+        """Count a batch that took `duration`, s."""
+        paced = 0
+        for pending in batch:  # `sum` would call a function for each request
+            if pending.needed:
+                paced += 1
+        if paced:
+            self.paced_s += duration * paced / len(batch)
 
     def mark_idle(self) -> float:
         """Mark the policy's thread as idle, and return the current time, s."""
@@ -358,7 +346,16 @@ class QueueLoad(NamedTuple):
     """Mean load of a queue since the last reading."""
 
     utilisation: float  # share of the time in which the policy's thread was busy, in [0, 1]
-    waiting: float  # mean number of requests in the queue
+    paced: float  # share of the time in which it computed for robots with slack, in [0, 1]
+
+    def needed(self, robots_need: float) -> float:
+        """Return the share of the time that the clients need the policy's thread, in [0, 1]. Robots
+        with slack also use the remaining time, for fresher actions.
+
+        Args:
+            robots_need: The share that the robots with slack need.
+        """
+        return self.utilisation - self.paced + min(self.paced, robots_need)
 
 
 class LoadMeter:
@@ -371,7 +368,7 @@ class LoadMeter:
     def read(self) -> QueueLoad:
         """Return the mean load since the last call, or since the meter was created."""
         now = (time.perf_counter(), *self._queue.load_s())
-        elapsed_s, idle_s, waited_s = (
+        elapsed_s, idle_s, paced_s = (
             current - last for last, current in zip(self._last, now, strict=True)
         )
         self._last = now
@@ -379,4 +376,4 @@ class LoadMeter:
             return QueueLoad(0.0, 0.0)
 
         utilisation = min(1.0, max(0.0, 1.0 - idle_s / elapsed_s))
-        return QueueLoad(utilisation, waiting=max(0.0, waited_s / elapsed_s))
+        return QueueLoad(utilisation, min(utilisation, paced_s / elapsed_s))

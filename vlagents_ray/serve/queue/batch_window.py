@@ -29,8 +29,8 @@ from collections.abc import Container, Sequence
 from typing import Any
 
 from vlagents_ray.protocol.messages import Priority
-from vlagents_ray.serve.fleet import CostCurve
 from vlagents_ray.serve.queue.fair_queue import FairQueue
+from vlagents_ray.serve.queue.robots_load import CostCurve
 from vlagents_ray.serve.requests import PendingRequest
 
 _KEPT = 0.95  # factor by which the weight of a batch decreases with each later batch

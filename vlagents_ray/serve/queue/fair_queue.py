@@ -15,7 +15,7 @@ approaches. A client therefore gains nothing if it sends less slack than it has.
 wait, and no simulation, is added to a batch if its row alone would make the most urgent answer
 late.
 
-If the robots need more than the replica can compute, the robots that it cannot serve in time
+If the robots need more than the replica can compute, the robots of the newest episodes
 (`PendingRequest.waits_behind_others`) wait behind all other robots, but at most for
 `BEHIND_OTHERS_S`.
 

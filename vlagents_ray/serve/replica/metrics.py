@@ -21,10 +21,8 @@ from ray.util.metrics import Counter, Gauge, Histogram
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected
-from vlagents_ray.serve.in_time import goodput
 from vlagents_ray.serve.periodic import Periodic
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
-from vlagents_ray.serve.scaling.slo_load import RobotsLoadMeter
 
 logger = logging.getLogger(__name__)
 
@@ -112,7 +110,7 @@ class Exporter:
         self._uncompiled = make(
             Gauge, "uncompiled", "Batch sizes that run without the configured compilation."
         )
-        # The next five series describe robots that report their ticks.
+        # The next three series describe robots that report their ticks.
         self._ticks = make(
             Counter,
             "ticks",
@@ -132,26 +130,11 @@ class Exporter:
             "priority",
             boundaries=MS_BOUNDARIES,
         )
-        self._robots = make(
-            Gauge, "robots", "Robots that reported ticks in the last 10 s.", "priority"
-        )
-        self._goodput = make(
-            Gauge,
-            "goodput",
-            "Robots whose share of ticks in time reached its target.",
-            "priority",
-        )
-        self._slo_load = make(
-            Gauge,
-            "slo_load",
-            "Share of a replica that its robots need to be in time, according to their SLOs.",
-        )
         self._unreadable = make(
             Gauge, "keys_unreadable_s", "Time in which the key file could not be read."
         )
         self._keys = keys
         self._meter = LoadMeter(engine.queue)
-        self._robots_load = RobotsLoadMeter(engine)
         self._periodic = Periodic(PERIOD_S)
 
     def start(self) -> None:
@@ -177,23 +160,13 @@ class Exporter:
         sessions = self._engine.sessions.by_transport()
         for transport in _TRANSPORTS:
             self._sessions.set(sessions.get(transport, 0), {"transport": transport})
-        self._export_robots()
         self._utilisation.set(self._meter.read().utilisation)
-        self._slo_load.set(self._robots_load.read().load)
         self._version.set(self._engine.weights.number)
         self._uncompiled.set(len(self._engine.model.uncompiled))
         for kind, size in self._engine.model.gpu_memory().items():
             self._gpu_memory.set(size, {"kind": kind})
 
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
-
-    def _export_robots(self) -> None:
-        """Export the number of robots, and the number of robots in time."""
-        now, times = self._engine.clock(), self._engine.sessions.times()
-        for priority, count in goodput(times, now).items():
-            tags = {"priority": priority.name.lower()}
-            self._robots.set(count.robots, tags)
-            self._goodput.set(count.in_time, tags)
 
     def _export_collected(self, collected: Collected) -> None:
         for (op, transport, priority, code), sample in collected.requests.items():

@@ -25,7 +25,6 @@ from vlagents_ray.protocol.messages import (
     PROTOCOL_VERSION,
     SERVERS_MACHINE,
     MessageLimits,
-    Priority,
     StreamAddress,
     boot_id,
 )
@@ -35,7 +34,6 @@ from vlagents_ray.ray_tools.private import (
     has_channels,
     http_options,
     replica_is_ending,
-    report_to_autoscaling,
 )
 from vlagents_ray.ray_tools.session import cluster_id
 from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_plain_http
@@ -55,25 +53,15 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.shutdown import Shutdown
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender, message_admission
-from vlagents_ray.serve.in_time import goodput
 from vlagents_ray.serve.local_agent import build_engine, policy_metadata
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.replica.part import PartContext, open_parts
-from vlagents_ray.serve.scaling.autoscaling import (
-    LATE_ROBOTS,
-    MOVED_LOAD,
-    SESSIONS,
-    SLO_LOAD,
-    SLO_ROBOTS,
-    UTILISATION,
-    WAITING,
-)
+from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION
 from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, SessionMigrator
 from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS, SiblingApi, SiblingReplicas
-from vlagents_ray.serve.scaling.slo_load import RobotsLoad, RobotsLoadMeter
 
 logger = logging.getLogger(__name__)
 
@@ -83,9 +71,6 @@ _WATCH_S = 0.25
 _LOCKED_S = 1.0
 _STDERR = 2
 _GATEWAY_POLL_S = 10.0
-# Interval at which a replica checks its robots' load for changes, s, and the smallest change that
-# it reports immediately.
-_CHANGES_S, _CHANGED_LOAD = 0.5, 0.05
 # Time for clients of a draining replica to connect to another replica before their WebSockets are
 # closed, s.
 _LEAVE_S = 5.0
@@ -139,8 +124,6 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._configured = False
         self._migrator.start(self._engine)
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
-        self._robots_load = RobotsLoadMeter(self._engine)
-        self._reported = RobotsLoad()  # last load that was reported to Serve's controller
 
         # The parts that plug-ins add, and the metrics.
         node = ray.get_runtime_context().get_node_id()[:8]
@@ -216,7 +199,6 @@ class PolicyReplica(ClientApi, SiblingApi):
             self._watch_shutdown(),
             self._peers.announce_this_replica(),
             self._rebalancer.run(),
-            self._report_changes(),
             self._parts.run(),
         ]
         if self._gateway is not None:
@@ -264,17 +246,9 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Return the load since the last call, for `MeasuredLoad`; called periodically by Serve."""
-        load = self._meter.read()
-        reported = goodput(self._engine.sessions.times(), self._engine.clock())
-        needed = self._reported = self._robots_load.read()
         return {
-            UTILISATION: load.utilisation,
-            WAITING: load.waiting / self._args.batch.max_size,
+            UTILISATION: self._meter.read().needed(self._engine.pace.needed()),
             SESSIONS: float(len(self._engine.sessions)),
-            SLO_LOAD: needed.load,
-            MOVED_LOAD: needed.moved_load,
-            SLO_ROBOTS: float(needed.robots),
-            LATE_ROBOTS: float(reported[Priority.ROBOT].late),
         }
 
     def __serve_build_asgi_app__(self) -> ASGIApp:
@@ -392,7 +366,6 @@ class PolicyReplica(ClientApi, SiblingApi):
     def _load_of(self, sessions: int) -> ReplicaLoad:
         accepts = self._engine.health.ready and not (self._engine.draining or replica_is_ending())
         node = ray.get_runtime_context().get_node_id()
-        needed = self._robots_load.read()
         return ReplicaLoad(
             self._peers.own_name,
             sessions,
@@ -400,8 +373,6 @@ class PolicyReplica(ClientApi, SiblingApi):
             node,
             boot_id(),
             self._engine.model.version,
-            needed.robots,
-            needed.load,
         )
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
@@ -449,17 +420,6 @@ class PolicyReplica(ClientApi, SiblingApi):
         if await asyncio.to_thread(_others_run):
             self._engine.drain_list.drain()
         self._shutdown.begin(_LEAVE_S if self._engine.draining else 0.0)
-
-    async def _report_changes(self) -> None:
-        """Report the load to Serve's controller as soon as the needs of the robots change clearly,
-        so that a burst of robots need not wait for the next report.
-        """
-        while True:
-            await asyncio.sleep(_CHANGES_S)
-            load = self._robots_load.read()
-            has_come_or_left = load.robots != self._reported.robots
-            if has_come_or_left or abs(load.load - self._reported.load) > _CHANGED_LOAD:
-                report_to_autoscaling()
 
     async def _poll_gateways(self) -> None:
         """Query the gateway periodically for its addresses, which may change without a restart

@@ -1,12 +1,11 @@
-"""Balances sessions over the replicas: new sessions go to the least loaded replica, according to
-the needs of its robots as far as they are known, and surplus sessions are moved.
+"""Balances sessions over the replicas: new sessions go to the replica with the fewest sessions, and
+surplus sessions are moved.
 
 A connection stays at its replica until it ends, and so does a client that sends HTTP requests to a
 replica's own port. A new replica alone would therefore not relieve the other replicas. Therefore
-each replica compares its load with the other replicas every few seconds: the needs of the robots if
-all needs are known, otherwise the number of sessions. If its load is clearly above its share, it
-requests some clients to reconnect. Their sessions then move in the same way as when a replica stops
-(`vlagents_ray.serve.scaling.session_migration`).
+each replica compares its number of sessions with the other replicas every few seconds. If its
+number is clearly above its share, it requests some clients to reconnect. Their sessions then move
+in the same way as when a replica stops (`vlagents_ray.serve.scaling.session_migration`).
 
 Clients that read JSON at the server's port, and clients of dialects, cannot be requested to
 reconnect. The load balancer's hash of their session's name selects their replica, again after each
@@ -17,7 +16,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import random
 import time
 from collections import Counter, deque
@@ -25,10 +23,9 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.scaling.slo_load import PARTS, loads_by_connection
 
 # Tolerated excess over the mean, as a share of the mean; at least one session is tolerated.
 _SLACK = 0.25
@@ -54,14 +51,6 @@ class ReplicaLoad:
     boot_id: str  # boot id of the replica's machine
     # Version of the policy and its shared objects; sessions move only between equal versions.
     version: tuple[str, str]
-    robots: int = 0  # number of its sessions whose needs are known
-    load: float = 0.0  # load of these robots, see `scaling.slo_load`
-
-    @property
-    def needs_are_known(self) -> bool:
-        """Whether `load` covers all sessions of the replica."""
-        # A replica that has not answered a robot yet does not know its costs.
-        return self.robots == self.sessions and (self.load > 0 or not self.robots)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,56 +71,24 @@ class ClientLocation:
 
 
 def choose_replica(loads: Sequence[ReplicaLoad], location: ClientLocation) -> ReplicaLoad | None:
-    """Return the least loaded replica near the client, or the least loaded of all replicas if its
-    load is clearly lower.
+    """Return the replica near the client with the fewest sessions, or the one of all replicas if
+    that has clearly fewer sessions.
 
     Among equally loaded replicas, the first is chosen. The result is None if no replica accepts
     sessions, or if the client needs a near replica and there is none.
     """
     accepting = [load for load in loads if load.accepts]
-    candidates = [
-        _Candidate(sessions, load)
-        for sessions, load in zip(mean_sessions(accepting), accepting, strict=True)
-    ]
-    least_loaded = min(candidates, key=attrgetter("sessions"), default=None)
+    least_loaded = min(accepting, key=attrgetter("sessions"), default=None)
     near = min(
-        (candidate for candidate in candidates if location.is_near(candidate.load)),
+        (load for load in accepting if location.is_near(load)),
         key=attrgetter("sessions"),
         default=None,
     )
     if location.must_be_near or least_loaded is None:
-        return None if near is None else near.load
+        return near
     if near is not None and near.sessions <= _tolerated(least_loaded.sessions):
-        return near.load
-    return least_loaded.load
-
-
-class _Candidate(NamedTuple):
-    """A replica for a client."""
-
-    sessions: float  # number of sessions, computed by `mean_sessions`
-    load: ReplicaLoad
-
-
-def mean_sessions(loads: Sequence[ReplicaLoad]) -> list[float]:
-    """Return the load of each replica as a number of mean sessions: sessions that need as much as
-    the mean robot of all replicas. If no needs are known, the result is the number of sessions.
-
-    A session with unknown needs counts as one, such as the session of a client that was just sent
-    to a replica, or of a robot at a replica that has not measured its batches yet.
-    """
-    known = [load for load in loads if load.load > 0]
-    robots = sum(load.robots for load in known)
-    total = sum(load.load for load in known)
-    counts: list[float] = []
-    for load in loads:
-        if load.load > 0:
-            others = load.sessions - load.robots
-            # Rounded, so that equal loads are equal.
-            counts.append(round(load.load * robots / total + others, 6))
-        else:
-            counts.append(float(load.sessions))
-    return counts
+        return near
+    return least_loaded
 
 
 def excess_sessions(mine: int, siblings: Iterable[int], leaving: int = 0) -> int:
@@ -151,19 +108,6 @@ def excess_sessions(mine: int, siblings: Iterable[int], leaving: int = 0) -> int
     return mine - leaving - -(-sum(loads) // len(loads))
 
 
-def excess_load(mine: ReplicaLoad, siblings: Sequence[ReplicaLoad], leaving: float = 0.0) -> float:
-    """Return the load that a replica should send away, without the `leaving` load. The result is
-    the excess over the mean load; 0 if that is at most 25 % of the mean, or less than the replica's
-    mean robot needs.
-    """
-    loads = [mine.load, *(sibling.load for sibling in siblings)]
-    mean = sum(loads) / len(loads)
-    excess = mine.load - leaving - mean
-    tolerated = max(_SLACK * mean, mine.load / max(1, mine.robots))
-    is_clear = excess > tolerated and not math.isclose(excess, tolerated)
-    return excess if is_clear else 0.0
-
-
 def choose_connections(connections: Counter[str], count: int) -> set[str]:
     """Choose the connections to send away, from the number of sessions of each connection. At most
     `count` sessions leave. All sessions of a connection move together, so a connection with more
@@ -179,18 +123,6 @@ def choose_connections(connections: Counter[str], count: int) -> set[str]:
 
 def _tolerated(sessions: float) -> float:
     return sessions + max(1.0, _SLACK * sessions)
-
-
-@dataclass(frozen=True, slots=True)
-class _Excess:
-    """The excess that a replica should send away: a number of sessions, or a load in `PARTS`."""
-
-    sizes: Counter[str]  # sizes by connection
-    amount: int  # in the unit of `sizes`
-    text: str  # for the log
-
-
-_EVEN = _Excess(Counter(), 0, "0")
 
 
 class Siblings(Protocol):
@@ -330,31 +262,29 @@ class Rebalancer:
         sessions.drop_idle()
 
         mine = self.load()
-        excess = _EVEN
+        movable: Counter[str] = Counter()  # number of sessions by connection
+        excess = 0
         has_joined = False
         if mine.sessions > 1 and mine.accepts:  # a single session is never too many
             siblings = [load for load in await self._siblings.some_loads() if load.accepts]
             has_joined = self._have_joined(siblings)
             mine = self.load()  # sessions may have begun or ended while the others answered
             if siblings and all(load.version == mine.version for load in siblings):
-                excess = self._excess(mine, siblings)
+                movable, excess = self._excess(mine, siblings)
 
         # A temporary imbalance may end by itself, but a replica that has joined would stay empty.
-        if excess.amount <= 0 or not (self._uneven or has_joined):
+        if excess <= 0 or not (self._uneven or has_joined):
             drain_list.mark(set())
         else:
-            lately = drain_list.asked_within(_RECONNECT_S)
-            movable = Counter(
-                {group: size for group, size in excess.sizes.items() if group not in lately}
-            )
-            chosen = choose_connections(movable, excess.amount)
-            drain_list.mark(set(sorted(chosen)[:_AT_ONCE]))
+            for connection in drain_list.asked_within(_RECONNECT_S):
+                del movable[connection]
+            drain_list.mark(choose_connections(movable, min(excess, _AT_ONCE)))
             logger.info(
-                "%d sessions, %s more than a fair share: some clients are requested to reconnect",
+                "%d sessions, %d more than a fair share: some clients are requested to reconnect",
                 mine.sessions,
-                excess.text,
+                excess,
             )
-        self._uneven = excess.amount > 0
+        self._uneven = excess > 0
 
     def _have_joined(self, siblings: Sequence[ReplicaLoad]) -> bool:
         """Return whether some of the replicas were not in any comparison before, and
@@ -365,28 +295,20 @@ class Rebalancer:
         self._compared = names | before
         return not is_first and not names <= before
 
-    def _excess(self, mine: ReplicaLoad, siblings: Sequence[ReplicaLoad]) -> _Excess:
-        """Return the excess that this replica should send away.
+    def _excess(
+        self, mine: ReplicaLoad, siblings: Sequence[ReplicaLoad]
+    ) -> tuple[Counter[str], int]:
+        """Return the number of sessions of each connection that can be requested to reconnect, and
+        the number of sessions that this replica should send away.
 
         Args:
             mine: The load of this replica.
             siblings: The loads of the other replicas.
         """
-        # The number of sessions of each connection that can be requested to reconnect.
-        active = self._engine.sessions.movable_by_connection(_ACTIVE_S)
+        movable = self._engine.sessions.movable_by_connection(_ACTIVE_S)
         # The connections that were requested to reconnect, and have not left yet.
         asked = self._engine.drain_list.asked_within(_SETTLE_S)
-        if all(load.needs_are_known for load in (mine, *siblings)):
-            movable = [
-                session
-                for session in self._engine.sessions.all()
-                if session.origin.connection in active
-            ]
-            loads = loads_by_connection(self._engine, movable)
-            leaving = sum(size for group, size in loads.items() if group in asked)
-            load = excess_load(mine, siblings, leaving / PARTS)
-            return _Excess(loads, math.ceil(load * PARTS), f"a load of {load:.2f}")
-
-        leaving = sum(count for group, count in active.items() if group in asked)
-        count = excess_sessions(mine.sessions, [load.sessions for load in siblings], leaving)
-        return _Excess(active, min(count, _AT_ONCE), str(count))
+        leaving = sum(count for connection, count in movable.items() if connection in asked)
+        return movable, excess_sessions(
+            mine.sessions, [load.sessions for load in siblings], leaving
+        )

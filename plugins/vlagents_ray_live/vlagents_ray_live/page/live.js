@@ -153,10 +153,6 @@ function showFleet(now) {
     byId("checkpoint").title = digests.join("\n");
     document.title = `${policies[0].policy}, live`;
   }
-  // Robots that report their ticks, and those of them that had enough actions in time.
-  const total = (name) => policies.reduce((sum, one) => sum + one.robots[name], 0);
-  byId("goodput").hidden = !total("robots");
-  byId("goodput").textContent = `${total("in_time")} of ${total("robots")} robots in time`;
   const several = new Set(policies.map((one) => one.policy)).size > 1;
   const rows = [...replicas].sort().map(([name, one]) => {
     const { said, events } = one;

@@ -10,14 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.fleet import (
+from vlagents_ray.serve.queue.robots_load import (
     IDLE,
     USABLE,
     CostCurve,
     RobotNeed,
     answer_s,
-    most_robots,
-    replica_load,
+    robots_load,
 )
 
 PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled
@@ -28,7 +27,6 @@ needs = st.builds(
     RobotNeed,
     st.sampled_from([1.0, 5.0, 10.0, 50.0]),
     st.sampled_from([1, 8, 16, 50]),
-    st.none() | st.floats(0.05, 5.0),
 )
 
 
@@ -59,9 +57,7 @@ def test_a_curve_that_cannot_be_is_refused(wrong: dict) -> None:
         CostCurve(**wrong)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"hz": 0.0}, {"hz": math.nan}, {"hz": 1.0, "rows": 0}, {"hz": 1.0, "age_s": 0.0}]
-)
+@pytest.mark.parametrize("wrong", [{"hz": 0.0}, {"hz": math.nan}, {"hz": 1.0, "rows": 0}])
 def test_a_need_that_cannot_be_is_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=r"expected .* got"):
         RobotNeed(**wrong)
@@ -70,42 +66,40 @@ def test_a_need_that_cannot_be_is_refused(wrong: dict) -> None:
 def test_a_robot_replans_before_its_rows_are_executed() -> None:
     assert CHUNKS_OF_50.interval_s(0.5) == pytest.approx(4.5)
     assert CHUNKS_OF_50.interval_s(5.0) == 0.0
-    assert RobotNeed(10.0, 50, age_s=1.0).interval_s(0.4) == pytest.approx(0.6)
-    assert RobotNeed(10.0, 50, age_s=0.4).interval_s(0.4) == 0.0
-    assert RobotNeed(10.0, 50, age_s=0.45).interval_s(0.4) == 0.1  # once per tick
+    assert CHUNKS_OF_50.interval_s(4.95) == 0.1  # once per tick
 
 
 def test_a_robot_with_single_actions_asks_once_a_tick() -> None:
     lone = RobotNeed(10.0, 1)
     assert lone.interval_s(0.1) == 0.1
     assert lone.interval_s(0.11) == 0.0
-    assert RobotNeed(10.0, 1, age_s=0.05).interval_s(0.06) == 0.0
 
 
 def test_nobody_is_no_load() -> None:
-    assert replica_load(PI0, {}, 16) == IDLE
+    assert robots_load(PI0, {}, 16) == IDLE
 
 
 def test_a_policy_that_is_slower_than_a_tick_serves_no_robot() -> None:
-    slow = replica_load(CostCurve(0.2), {RobotNeed(10.0, 1): 1}, 16)
+    slow = robots_load(CostCurve(0.2), {RobotNeed(10.0, 1): 1}, 16)
     assert slow.load == math.inf
     assert not slow.in_time
 
 
-def test_the_largest_fleet_is_that_of_the_costs() -> None:
+def test_the_largest_fleet_in_time_follows_from_the_durations() -> None:
     # Batches of 16 take 158 ms. A robot needs one answer every 5 s minus twice this time.
-    by_hand = USABLE * 16 / 0.15826 * (5.0 - 2 * 0.15826)
-    assert most_robots(PI0, CHUNKS_OF_50, 16) == math.floor(by_hand)
+    by_hand = math.floor(USABLE * 16 / 0.15826 * (5.0 - 2 * 0.15826))
+    assert robots_load(PI0, {CHUNKS_OF_50: by_hand}, 16).in_time
+    assert not robots_load(PI0, {CHUNKS_OF_50: by_hand + 1}, 16).in_time
 
 
 @given(costs, st.dictionaries(needs, st.integers(1, 30), min_size=1, max_size=4), needs)
 def test_a_further_robot_never_makes_a_replica_emptier(
     curve: CostCurve, robots: dict[RobotNeed, int], newcomer: RobotNeed
 ) -> None:
-    before = replica_load(curve, robots, 16).load
+    before = robots_load(curve, robots, 16).load
     more = {**robots, newcomer: robots.get(newcomer, 0) + 1}
     # With the new robot, batches may have one more row than before.
-    after = replica_load(curve, more, min(16, sum(robots.values()))).load
+    after = robots_load(curve, more, min(16, sum(robots.values()))).load
     assert after >= before
 
 
@@ -113,7 +107,7 @@ def test_a_further_robot_never_makes_a_replica_emptier(
 def test_robots_that_replan_as_told_use_no_more_than_the_replica_has(
     curve: CostCurve, robots: dict[RobotNeed, int]
 ) -> None:
-    load = replica_load(curve, robots, 16)
+    load = robots_load(curve, robots, 16)
     if not load.in_time:
         return
     requests_hz = sum(count / load.replan_s(need) for need, count in robots.items())
@@ -122,13 +116,13 @@ def test_robots_that_replan_as_told_use_no_more_than_the_replica_has(
 
 
 def load_by_size(
-    costs: CostCurve, needs: Mapping[RobotNeed, int], max_batch_size: int, transport_s: float
+    costs: CostCurve, needs: Mapping[RobotNeed, int], max_batch_size: int
 ) -> list[float]:
     """Return the load for each batch size, computed robot by robot, until some robot is late."""
     robots = sum(needs.values())
     loads = []
     for size in range(1, min(max_batch_size, robots) + 1):
-        latency_s = answer_s(costs, size, robots) + transport_s
+        latency_s = answer_s(costs, size, robots)
         intervals_s: list[float] = []
         for need, count in needs.items():
             intervals_s += [need.interval_s(latency_s)] * count
@@ -143,7 +137,6 @@ different_needs = st.builds(
     RobotNeed,
     st.floats(0.5, 50.0),
     st.sampled_from([1, 2, 8, 50]),
-    st.none() | st.floats(0.05, 5.0),
 )
 
 
@@ -151,20 +144,19 @@ different_needs = st.builds(
     costs=costs,
     needs=st.dictionaries(different_needs, st.integers(1, 4), min_size=1, max_size=30),
     max_batch_size=st.integers(1, 64),
-    transport_s=st.floats(0.0, 0.1),
 )
 def test_the_load_of_different_robots_is_that_of_one_after_the_other(
-    costs: CostCurve, needs: dict[RobotNeed, int], max_batch_size: int, transport_s: float
+    costs: CostCurve, needs: dict[RobotNeed, int], max_batch_size: int
 ) -> None:
-    load = replica_load(costs, needs, max_batch_size, transport_s)
-    loads = load_by_size(costs, needs, max_batch_size, transport_s)
+    load = robots_load(costs, needs, max_batch_size)
+    loads = load_by_size(costs, needs, max_batch_size)
     if not loads:
         assert (load.load, load.batch_size) == (math.inf, 1)
         return
     assert load.load == pytest.approx(min(loads))
     assert loads[load.batch_size - 1] == pytest.approx(min(loads))
     robots = sum(needs.values())
-    assert load.latency_s == answer_s(costs, load.batch_size, robots) + transport_s
+    assert load.latency_s == answer_s(costs, load.batch_size, robots)
 
     # Together the robots send as many requests as the replica can answer, and no robot runs out of
     # rows.

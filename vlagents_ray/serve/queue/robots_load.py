@@ -1,11 +1,10 @@
-"""The number of robots that a replica can serve in time, from the costs of its batches and the
-needs of the robots.
+"""The share of a replica that its robots need, from the durations of its batches and the needs of
+the robots.
 
 A robot executes one row of an action chunk at each tick, and needs the next chunk before it has
 executed the last row. A request waits for the batch that is running when the request arrives, and
-then for its own batch. Its answer therefore takes the time of two batches and the transport. The
-longer this takes, the fewer rows of the answer are left to execute. The queue, the check of a
-robot's SLO at its reset and autoscaling use this arithmetic.
+then for its own batch. Its answer therefore takes the time of two batches. The longer this takes,
+the fewer rows of the answer are left to execute.
 """
 
 from __future__ import annotations
@@ -85,16 +84,13 @@ class RobotNeed:
     """
 
     hz: float  # ticks per second
-    rows: int = 1  # maximum number of rows of an answer that the robot executes
-    age_s: float | None = None  # largest allowed age of an executed action, s; None for any age
+    rows: int = 1  # number of rows of an answer
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.hz) and self.hz > 0):
             raise ConfigError(f"hz: expected a rate above 0, got {self.hz}")
         if self.rows < 1:
             raise ConfigError(f"rows: expected at least 1, got {self.rows}")
-        if self.age_s is not None and not self.age_s > 0:
-            raise ConfigError(f"age_s: expected seconds above 0, or None, got {self.age_s}")
 
     def interval_s(self, latency_s: float) -> float:
         """Return the longest time between two requests with which the robot is in time, s.
@@ -116,16 +112,11 @@ class RobotNeed:
 
     @property
     def longest_s(self) -> float:
-        """The longest time from the capture of an observation until the next answer, s.
-
-        The oldest action is executed just before the next answer arrives. If each answer has one
-        action, that action is as old as its answer took.
-        """
-        plan_s = self.rows / self.hz
-        return plan_s if self.age_s is None else min(plan_s, self.age_s)
+        """The longest time from the capture of an observation until the next answer, s."""
+        return self.rows / self.hz
 
 
-class ReplicaLoad(NamedTuple):
+class RobotsLoad(NamedTuple):
     """The share of a replica that its robots need."""
 
     load: float
@@ -155,15 +146,12 @@ class ReplicaLoad(NamedTuple):
         return min(self.interval_s, share * need.interval_s(self.latency_s))
 
 
-IDLE = ReplicaLoad(0.0, 1, 0.0, 0.0)
+IDLE = RobotsLoad(0.0, 1, 0.0, 0.0)
 
 
-def replica_load(
-    costs: CostCurve,
-    needs: Mapping[RobotNeed, int],
-    max_batch_size: int,
-    transport_s: float = 0.0,
-) -> ReplicaLoad:
+def robots_load(
+    costs: CostCurve, needs: Mapping[RobotNeed, int], max_batch_size: int
+) -> RobotsLoad:
     """Compute the load of a replica with the batch size that minimizes the load.
 
     Small batches answer sooner, and large batches answer more requests per second.
@@ -172,7 +160,6 @@ def replica_load(
         costs: The duration of the replica's batches.
         needs: The number of robots with each need.
         max_batch_size: The largest batch of the replica.
-        transport_s: The time that a request and its answer spend in the transport, s.
     """
     robots = sum(needs.values())
     if not robots:
@@ -180,13 +167,13 @@ def replica_load(
 
     sizes = np.arange(1, min(max_batch_size, robots) + 1)
     costs_s = np.array([costs.cost_s(size) for size in sizes.tolist()])
-    latencies_s = np.array([answer_s(costs, size, robots) for size in sizes.tolist()]) + transport_s
+    latencies_s = np.array([answer_s(costs, size, robots) for size in sizes.tolist()])
     needed_hz = _needed_hz(needs, latencies_s)
     too_late = np.flatnonzero(np.isinf(needed_hz))
     # Larger batches take even longer.
     usable_sizes = int(too_late[0]) if len(too_late) else len(sizes)
     if not usable_sizes:
-        return ReplicaLoad(math.inf, 1, float(latencies_s[0]))
+        return RobotsLoad(math.inf, 1, float(latencies_s[0]))
 
     loads = (needed_hz * costs_s / sizes)[:usable_sizes]
     best = int(np.argmin(loads))
@@ -194,7 +181,7 @@ def replica_load(
     share = max(_RELAXED, load / USABLE)
     paced_s = [(share * need.interval_s(latency_s), count) for need, count in needs.items()]
     usable_hz = USABLE * size / costs.cost_s(size)
-    return ReplicaLoad(load, size, latency_s, _common_interval_s(paced_s, usable_hz))
+    return RobotsLoad(load, size, latency_s, _common_interval_s(paced_s, usable_hz))
 
 
 def _needed_hz(needs: Mapping[RobotNeed, int], latencies_s: np.ndarray) -> np.ndarray:
@@ -241,19 +228,3 @@ def answer_s(costs: CostCurve, size: int, robots: int) -> float:
     is running.
     """
     return costs.cost_s(size) * (1 if robots == 1 else 2)
-
-
-def most_robots(
-    costs: CostCurve, need: RobotNeed, max_batch_size: int, transport_s: float = 0.0
-) -> int:
-    """Return the largest number of equal robots that a replica can serve in time."""
-    most, too_many = 0, 1
-    while replica_load(costs, {need: too_many}, max_batch_size, transport_s).in_time:
-        most, too_many = too_many, 2 * too_many
-    while too_many - most > 1:
-        robots = (most + too_many) // 2
-        if replica_load(costs, {need: robots}, max_batch_size, transport_s).in_time:
-            most = robots
-        else:
-            too_many = robots
-    return most
