@@ -121,5 +121,5 @@ def test_each_checkpoint_is_evaluated_once_it_is_whole_by_one_server_and_gets_a_
     assert [case.step for case in results.cases] == [10, 20, 30]
     assert "step 20: not yet: has no done" in (tmp_path / "log").read_text()
     assert {one["checkpoint"] for one in results.policies.values()} == {
-        str(runs / "10" / "number")
-    }, "one server"
+        str(runs / "30" / "number")
+    }, "the server has the last checkpoint"

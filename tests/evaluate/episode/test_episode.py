@@ -17,9 +17,11 @@ from vlagents_ray.errors import (
     EnvFailed,
     InvalidAction,
     PolicyFailed,
+    PolicyUnavailable,
     UnknownSession,
 )
 from vlagents_ray.evaluate.episode.episode import Images
+from vlagents_ray.evaluate.episode.failures import explain
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
 
@@ -434,6 +436,27 @@ def test_the_result_says_which_checkpoint_and_weights_played_and_how_long_each_s
     unserved = run_episode(Script(), Chunks(*[ROW] * 6), KEY)
     versions = unserved.first_policy_version, unserved.policy_version, unserved.policy_fingerprint
     assert (unserved.checkpoint, *versions) == (None,) * 4
+
+
+def test_an_episode_with_another_checkpoint_than_that_of_its_case_is_lost_to_infrastructure() -> (
+    None
+):
+    """The server may be loading the case's checkpoint, so the episode is repeated."""
+
+    class Served(Chunks):
+        def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+            super().reset(obs, instruction, **kwargs)
+            return {"checkpoint": "runs/10"}
+
+    result = run_episode(Script(), Served(*[ROW] * 6), KEY, checkpoint="runs/10")
+    assert result.checkpoint == "runs/10"
+    with pytest.raises(
+        PolicyUnavailable, match="expected an episode with the checkpoint 'runs/20'"
+    ):
+        run_episode(Script(), Served(*[ROW] * 6), KEY, checkpoint="runs/20")
+    assert explain(PolicyUnavailable("reset")).cause == "policy"
+    with pytest.raises(PolicyUnavailable, match="got one with None"):
+        run_episode(Script(), Chunks(*[ROW] * 6), KEY, checkpoint="runs/20")
 
 
 def test_a_policy_in_this_process_is_busy_while_it_is_waited_for() -> None:

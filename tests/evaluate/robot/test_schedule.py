@@ -160,6 +160,9 @@ def test_tasks_are_those_of_the_plan_and_patterns_match_them(tmp_path: Path) -> 
     ]
     with pytest.raises(ConfigError, match="expected none with a robot"):
         require_trials(plan(tmp_path, policies=pushed))
+    swept = [{"name": "base", "source": "pi0", "steps": [1, 2]}]
+    with pytest.raises(ConfigError, match=r"steps: .* name each checkpoint as a policy"):
+        require_trials(plan(tmp_path, policies=swept))
 
 
 def test_what_would_show_rates_before_the_end_is_refused(tmp_path: Path) -> None:

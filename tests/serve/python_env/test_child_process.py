@@ -45,6 +45,7 @@ from vlagents_ray.errors import (
     NotTrainable,
     PolicyFailed,
     PolicyUnavailable,
+    UnknownSession,
     VLAgentsError,
 )
 from vlagents_ray.policies.compilation import CudaGraph
@@ -54,6 +55,7 @@ from vlagents_ray.serve.engine.ability_call import is_method, name_of
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models import served_model
+from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.serve.python_env.child_agent import ChildAgent
 from vlagents_ray.serve.python_env.child_connection import ChildConnection
 from vlagents_ray.serve.python_env.child_main import Settings
@@ -400,6 +402,25 @@ def test_a_child_that_has_ended_leaves_the_other_metrics_of_the_replica() -> Non
 
 
 @pytest.mark.slow
+def test_a_swap_ends_the_child_and_starts_one_with_the_next_settings(tmp_path: Path) -> None:
+    notes = {name: str(tmp_path / name) for name in ("first", "second")}
+    policy = PolicySource(lambda config: agent(**config), {"notes": notes["first"]})
+    engine = Engine(policy)
+    engine.start()
+    assert ask(engine, "a", "reset", instruction="a task").error is None
+    process = engine.model.require_loaded().agent.child.process  # type: ignore[attr-defined]
+
+    engine.swap({"notes": notes["second"]})
+    assert process._process.poll() is not None, "the old child must have ended"
+    assert not Path(notes["second"]).exists()
+    with pytest.raises(UnknownSession):
+        ask(engine, "a", "act")
+    assert ask(engine, "a", "reset", instruction="a task").error is None
+    assert Path(notes["second"]).exists()
+    engine.close()
+
+
+@pytest.mark.slow
 def test_a_child_whose_batches_all_fail_is_replaced_as_a_replica_is() -> None:
     one = Engine(agent())
     one.start()
@@ -491,7 +512,7 @@ def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any],
     with pytest.raises(PolicyFailed) as seen:  # the message for the operator
         one.health.check()
     assert said in str(seen.value)
-    with pytest.raises(PolicyFailed) as told:  # the message for clients
+    with pytest.raises(PolicyUnavailable) as told:  # the message for clients
         one.health.require_ready()
     assert said not in str(told.value)
     assert sys.executable not in str(told.value)

@@ -11,6 +11,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from in_flight import asked
 from in_process_replicas import Replicas
 from onnx import numpy_helper
 from onnx.parser import parse_model
@@ -21,7 +22,10 @@ from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.policies.base import accelerator
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.model_inputs import resize_with_pad
+from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.testing import check_agent
 from vlagents_ray_models.onnx import Onnx
 
@@ -645,3 +649,27 @@ def test_a_file_that_is_no_model_is_refused(tmp_path: Path, name: str, message: 
     (tmp_path / name).unlink()
     with pytest.raises(ConfigError, match=r"expected one file .*got \[\]"):
         loaded(tmp_path, state=["x"])
+
+
+def test_a_replica_replaces_its_file_by_another_one(tmp_path: Path) -> None:
+    graph = "g (float[N, 1] x) => (float[N, 1] action) { action = MatMul(x, w) }"
+    for step in (1, 2):
+        (tmp_path / f"{step}").mkdir()
+        exported(tmp_path / f"{step}", graph, w=np.full((1, 1), step, np.float32))
+    config = {"checkpoint": str(tmp_path / "{step}" / "policy.onnx"), "state": ["x"]}
+    policy = PolicySource(Onnx.from_config, {**config, "checkpoint_step": 1})
+    engine = Engine(policy)
+    engine.start()
+    obs = Obs(state={"x": np.ones(1, np.float32)})
+    actions, digests = [], []
+    for step in (1, 2):
+        engine.swap({**config, "checkpoint_step": step})
+        for op in ("reset", "act"):
+            reply = asked(engine, "s", Request(op, obs)).get(timeout=10)
+            assert reply.error is None
+        assert reply.act is not None
+        actions.append(reply.act.action.tolist())
+        digests.append((engine.model.weights or {})["digest"])
+    engine.close()
+    assert actions == [[[1.0]], [[2.0]]]
+    assert digests[0] != digests[1]
