@@ -56,7 +56,6 @@ SEE = {
     "WorkerConfig.gpus": "cluster/scaling.md#gpus-for-rendering",
     "ServerArgs.policy": "policies/index.md",
     "ServerArgs.config": "reference/policies.md",
-    "ServerArgs.checkpoints": "checkpoints.md",
     "ServerArgs.autoscaling": "cluster/scaling.md",
     "ServerArgs.batch": "serving.md#batches",
     "ServerArgs.access": "keys.md",
