@@ -20,11 +20,13 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
 from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray.policies.base.adapter import LoraAdapter
+from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
+from vlagents_ray.weights.trainable import portable
 
 pytestmark = pytest.mark.torch
 
@@ -194,6 +196,8 @@ def test_a_family_without_a_network_of_torch_says_so() -> None:
         ({"a_setting_of_later_versions": 1}, "a_setting_of_later_versions"),
         ({"init_lora_weights": "pissa_niter_4"}, "init_lora_weights"),
         ({"lora_alpha": None}, "lora_alpha: expected a number, got None"),
+        ({"lora_alpha": True}, "lora_alpha: expected a number, got True"),
+        ({"lora_alpha": np.inf}, "lora_alpha: expected a number, got inf"),
         ({"base_model_name_or_path": "other/base"}, None),
     ],
 )
@@ -224,6 +228,10 @@ def broken(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
         | {"base_model.model.eye.lora_B.weight": np.ones((8, 2), np.float32)},
         "half": {"base_model.model.head.1.lora_A.weight": np.ones((2, 4), np.float32)},
         "shape": {first: np.ones((2, 5), np.float32)},
+        "empty": {first: np.ones((0, 4), np.float32)}
+        | {"base_model.model.see.lora_B.weight": np.ones((8, 0), np.float32)},
+        "prefix": {"see.lora_A.weight": np.ones((2, 4), np.float32)}
+        | {"see.lora_B.weight": np.ones((8, 2), np.float32)},
         "nan": {first: np.full((2, 4), np.nan, np.float32)},
         "whole numbers": {first: np.ones((2, 4), np.int8)},
         "no linear": {"base_model.model.head.1.lora_A.weight": np.ones((2, 4), np.float32)}
@@ -250,6 +258,8 @@ def broken(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
             "shape",
             r"see: expected A and B for weights of shape \(8, 4\), got A \(2, 5\) and B \(8, 2\)",
         ),
+        ("empty", r"see: expected A and B for .*, got A \(0, 4\) and B \(8, 0\)"),
+        ("prefix", r"expected pairs .*, got \['see.lora_A.weight', 'see.lora_B.weight'\]"),
         ("nan", "see: expected values that are finite as .*, got NaN or infinity"),
         ("whole numbers", "see: expected real numbers, got A int8 and B float32"),
         (
@@ -346,21 +356,69 @@ def test_a_damaged_config_is_refused(tmp_path: Path, content: str) -> None:
         loaded(tmp_path, adapter=str(tmp_path / "stack"))
 
 
-def test_the_change_is_scaled_before_it_is_rounded(tmp_path: Path) -> None:
+def test_the_change_is_scaled_and_added_before_it_is_rounded(tmp_path: Path) -> None:
     small = network(tmp_path).half()
     values = pairs(small, LAYERS, 2)
     tiny = {
         name: value * np.float32(1e-9) if ".lora_B." in name else value
         for name, value in values.items()
     }
-    before = small["see"].weight.detach().float().numpy()
+    before = small["see"].weight.detach().double().numpy()
     LoraAdapter.find(str(save(tmp_path / "tiny", tiny, lora_alpha=2e9))).merge_into(small)
-    change = small["see"].weight.detach().float().numpy() - before
     down, up = (values[f"base_model.model.see.lora_{part}.weight"] for part in "AB")
-    np.testing.assert_allclose(change, up @ down, atol=4e-3)
+    expected = (before + up.astype(np.float64) @ down).astype(np.float16)
+    assert np.array_equal(small["see"].weight.detach().numpy(), expected)
 
     huge = LoraAdapter.find(str(save(tmp_path / "huge", values, lora_alpha=2e6)))
     with pytest.raises(
         ConfigError, match=r"expected values that are finite as torch\.float16, got NaN or infinity"
     ):
         huge.merge_into(small)
+
+
+def test_an_adapter_may_be_saved_in_bfloat16(tmp_path: Path) -> None:
+    import torch
+
+    values = pairs(network(tmp_path), LAYERS, 2)
+    rounded = {name: torch.from_numpy(value).bfloat16() for name, value in values.items()}
+    saved = {name: portable(value) for name, value in rounded.items()}
+    policy = loaded(tmp_path, adapter=str(save(tmp_path / "stack", saved)))
+    merged = with_merged(tmp_path, {name: value.float().numpy() for name, value in rounded.items()})
+    got, expected = (begun(agent, 0).act(at(0)).action for agent in (policy, merged))
+    np.testing.assert_allclose(got, expected, rtol=RTOL, atol=RTOL)
+
+
+@pytest.mark.parametrize("settings", [{"groups": 2}, {"padding": 1, "padding_mode": "reflect"}])
+def test_other_convolutions_are_rejected(tmp_path: Path, settings: dict[str, Any]) -> None:
+    import torch
+
+    module = torch.nn.ModuleDict({"look": torch.nn.Conv2d(4, 8, 2, **settings)})
+    adapter = LoraAdapter.find(str(save(tmp_path / "stack", pairs(module, ["look"], 2))))
+    with pytest.raises(ConfigError, match=r"got {'look': 'Conv2d'}; merge the fine-tune into"):
+        adapter.merge_into(module)
+
+
+def test_the_base_of_an_adapter_may_be_named_by_its_hub_id_or_an_outer_folder(
+    tmp_path: Path,
+) -> None:
+    LoraAdapter(tmp_path, {"base_model_name_or_path": "org/base@main"}).require_base("org/base", [])
+    with pytest.raises(ConfigError, match="got one trained on 'org/other'"):
+        LoraAdapter(tmp_path, {"base_model_name_or_path": "org/other"}).require_base("org/base", [])
+
+    (tmp_path / "log.bin").write_bytes(b"log")
+    folder = base(tmp_path)
+    outer = LoraAdapter(tmp_path, {"base_model_name_or_path": str(tmp_path)})
+    outer.require_base(str(folder), [folder])
+
+
+def test_a_policy_without_files_of_its_own_has_no_identity(tmp_path: Path) -> None:
+    class WithoutFiles(Small):
+        def load(self) -> Any:
+            with used_checkpoints():  # the files of the base are not known
+                return super().load()
+
+    folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2))
+    policy = WithoutFiles.from_config({"checkpoint": str(base(tmp_path)), "adapter": str(folder)})
+    with used_checkpoints() as found:
+        policy.initialize()
+    assert (found, policy.weights_id) == ([], None)
