@@ -150,6 +150,36 @@ def test_the_running_batch_ends_on_the_old_model(
     assert [name for name, _ in library.batches if name == "b/2"] == []
 
 
+def test_requests_that_wait_keep_no_memory_of_the_old_model(
+    serving: Callable[..., Engine], library: Library
+) -> None:
+    engine = serving(max_batch_size=1)
+    gate = library.hold("b/2")
+    for session in ("taken", "waiting"):
+        reset(engine, session)
+    with engine.weights.acting_lock:  # the policy's thread waits with the first act
+        taken = ask(engine, "taken", "act")
+        wait_for(lambda: engine.queue.depth() == 0)
+        waiting = ask(engine, "waiting", "act")
+        swapping = Swapping(engine, "b/2")
+        wait_for(lambda: not engine.health.ready)
+    library.wait_for("b/2")
+    assert taken.get(timeout=10).act is not None
+    error = waiting.get(timeout=10).error
+    assert isinstance(error, PolicyUnavailable)
+    assert "loading" in str(error)
+    assert "a/1" not in library.alive
+    gate.set()
+    swapping.end()
+
+
+def test_a_swap_of_an_engine_that_stops_ends_at_once(serving: Callable[..., Engine]) -> None:
+    engine = serving()
+    engine.stop(timeout_s=10)
+    with pytest.raises(PolicyFailed, match="the replica is stopping"):
+        swap(engine, "b/2")
+
+
 def test_a_model_that_does_not_load_leaves_none_and_the_next_swap_recovers(
     serving: Callable[..., Engine], library: Library
 ) -> None:

@@ -10,7 +10,8 @@ import logging
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,6 +21,7 @@ from vlagents_ray.errors import (
     DeadlineExceeded,
     NotReset,
     PolicyFailed,
+    PolicyUnavailable,
     UnknownSession,
     VLAgentsError,
 )
@@ -125,25 +127,31 @@ class Runner:
 
         self._next_swap = swap
         self._queue.interrupt()
+        if not self._health.alive:
+            self._end_swap()
         if not wait([swap.done], self._load_s).done:
             raise TimeoutError(f"not loaded within {self._load_s:g} s, its limit")
         return swap.done.result()
 
     def _swap(self, swap: Swap) -> None:
-        """Answer the waiting requests with an error, and load the policy with other settings."""
-        deliver(self._unsent)
-        self._unsent = []
-        _, waiting = self._queue.clear()
-        for pending in waiting:
-            self._intake.fail(pending, self._model.loading())
-        del waiting  # the requests refer to the model, whose memory must be freed
-
+        """Load the policy with other settings. No request may be left, since it would refer to the
+        model, whose memory must be freed.
+        """
+        self._reject_waiting()
         try:
             self._model.load(swap.config)
         except BaseException as error:  # noqa: BLE001 - raised again by swap(), on the caller's thread
             swap.done.set_exception(error)
         else:
             swap.done.set_result(None)
+
+    def _reject_waiting(self) -> None:
+        """Deliver the answers of the last batch, and answer the waiting requests with an error."""
+        deliver(self._unsent)
+        self._unsent = []
+        _, waiting = self._queue.clear()
+        for pending in waiting:
+            self._intake.fail(pending, self._model.loading())
 
     def join(self, timeout_s: float) -> None:
         """Wait at most `timeout_s` for the end of the thread. The queue must be closed."""
@@ -196,6 +204,16 @@ class Runner:
             self._queue.poller.close()
         finally:
             self._health.end_thread()
+            self._end_swap()
+
+    def _end_swap(self) -> None:
+        """End a swap that the policy's thread will not begin, since the thread ends; called on
+        either thread, and perhaps on both.
+        """
+        swap, self._next_swap = self._next_swap, None
+        if swap is not None:
+            with suppress(InvalidStateError):
+                swap.done.set_exception(PolicyUnavailable("the replica is stopping; connect again"))
 
     def _without_late(self, taken: Taken) -> Taken:
         """Return the work without requests that have become useless since they left the queue."""

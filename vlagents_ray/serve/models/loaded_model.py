@@ -123,7 +123,7 @@ class Padding:
 class LoadedModel:
     """A loaded agent, and the data that its sessions share."""
 
-    settings: Mapping[str, Any]  # settings of the agent
+    checkpoint: str | None  # name of the checkpoint, see `checkpoint_name`
     agent: Agent
     contract: Contract | None
     copies: AgentCopies
@@ -159,11 +159,6 @@ class LoadedModel:
             if self.report.accelerated or (torch and torch.cuda.is_initialized())
             else threading.RLock()
         )
-
-    @property
-    def checkpoint(self) -> str | None:
-        """Name of the checkpoint, for the sessions."""
-        return checkpoint_name(self.settings)
 
     @property
     def identity(self) -> dict[str, str]:
@@ -368,7 +363,7 @@ class Loader:
         parameters = make(busy, digest.rpartition(":")[2][:_FINGERPRINT_DIGITS], version)
         calls = self._calls
         return LoadedModel(
-            settings,
+            checkpoint_name(settings),
             agent,
             contract,
             copies,
