@@ -13,6 +13,7 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
@@ -28,17 +29,22 @@ from vlagents_ray.evaluate.replay import find
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.combination import combined
 from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray.interface import Obs
 from vlagents_ray_results.merge import merge
 
 Config = Callable[..., EvalConfig]
 
 
 class Served(ToZero):
-    """Has metadata, like a policy on a server."""
+    """Has metadata and a checkpoint, like a policy on a server."""
 
-    def __init__(self, checkpoint: str) -> None:
+    def __init__(self, step: str) -> None:
         super().__init__()
-        self.metadata = {"policy": "act", "checkpoint": checkpoint}
+        self.metadata = {"policy": "act", "checkpoint": f"step {step}"}
+
+    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+        super().reset(obs, instruction, **kwargs)
+        return {"checkpoint": self.metadata["checkpoint"]}
 
 
 @pytest.fixture
