@@ -121,7 +121,7 @@ def lost_db(images: Mapping[str, np.ndarray], sent: Mapping[str, np.ndarray]) ->
 PACKAGES = ("vlagents-ray", "ray", "numpy", "torch", "jax", "transformers", "lerobot")
 
 
-def measured_on(program: str = "vlagents-ray") -> dict[str, Any]:
+def measured_on(program: str) -> dict[str, Any]:
     """Return date, command, machine and versions as JSON values; call this before measuring, as the
     values include the machine's load.
     """

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import inspect
 import json
 import os
 import sys
@@ -16,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -25,9 +24,7 @@ from benchmarks.drivers import CALL_S, START_S, ClientProcess, ProcessDriver
 from benchmarks.line_client import WARM_UP, obey, timed
 from benchmarks.line_process import our_environment
 from vlagents_ray.client.agent import RemoteAgent
-from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.images.codecs import ImageCodec
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
@@ -93,37 +90,20 @@ OWN_CLIENTS = (
 )
 
 
-def own_clients(only: Sequence[str] = ()) -> tuple[list[OwnClient], dict[str, str]]:
-    """Return the clients of this version, or those with a transport in `only`, and the reasons for
-    skipped clients.
-    """
-    known = get_args(TransportName)
-    wanted = [one for one in OWN_CLIENTS if not only or one.transport in only]
-    if unknown := set(only) - {one.transport for one in OWN_CLIENTS}:
-        known_here = sorted({one.transport for one in OWN_CLIENTS})
-        raise ConfigError(f"transports: expected only {known_here}, got {sorted(unknown)}")
-    skipped = {
-        w.name: f"no transport {w.transport!r} in this version"
-        for w in wanted
-        if w.transport not in known
-    }
-    return [one for one in wanted if one.transport in known], skipped
+def own_clients(only: Sequence[str] = ()) -> list[OwnClient]:
+    """Return all clients, or those with a transport in `only`."""
+    if unknown := set(only) - {client.transport for client in OWN_CLIENTS}:
+        known = sorted({client.transport for client in OWN_CLIENTS})
+        raise ConfigError(f"transports: expected only {known}, got {sorted(unknown)}")
+    return [client for client in OWN_CLIENTS if not only or client.transport in only]
 
 
-def connect(url: str, transport: str, codec: str, priority: str | None = None) -> RemoteAgent:
+def connect(url: str, transport: str, codec: str, priority: str = ROBOT) -> RemoteAgent:
     """Return an agent that has not connected yet.
 
-    `codec` is "auto", "raw", "jpeg", or "jpeg QUALITY SUBSAMPLING". `priority` is "robot" or
-    "simulation", and has no effect if `RemoteAgent` has no priorities.
+    `codec` is "auto", "raw" or "jpeg", and `priority` "robot" or "simulation".
     """
-    name, *details = codec.split()
-    chosen = ImageCodec(name, int(details[0]), details[1]) if details else codec
-    options = (
-        {"priority": priority}
-        if priority and "priority" in inspect.signature(RemoteAgent).parameters
-        else {}
-    )
-    return RemoteAgent(url, transport=transport, codec=chosen, **options)  # type: ignore[arg-type]
+    return RemoteAgent(url, transport=transport, codec=codec, priority=priority)  # type: ignore[arg-type]
 
 
 class BenchCaller:

@@ -41,10 +41,10 @@ def measure_with_peers(
         The result of `benchmarks.round_trips.measure(...).to_json()`, and the "versions" of the
         peers' packages.
     """
-    own, skipped = own_clients(transports)
+    own = own_clients(transports)
     found, absent, versions = others.peer_clients(peers, peers_python)
     trips = measure(
-        own, calls, progress, others=others.starters(found, peers_python), skipped=skipped | absent
+        own, calls, progress, others=others.starters(found, peers_python), skipped=absent
     )
     return trips.to_json() | {"versions": versions}
 

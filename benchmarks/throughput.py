@@ -98,10 +98,9 @@ def measure_throughput(
     """Measure the plan, with all fleets in a new random order in each round, and return plain JSON
     values.
     """
-    found, skipped = own_clients(plan.transports)
-    chosen = _one_each(found)
+    chosen = _one_each(own_clients(plan.transports))
     theirs, absent, versions = others.peer_clients(plan.peers, plan.peers_python)
-    skipped |= absent | {one.name: "its server has one client" for one in theirs if not one.several}
+    skipped = absent | {one.name: "its server has one client" for one in theirs if not one.several}
     served = deployment(
         plan.policy,
         config=dict(plan.config),
