@@ -300,8 +300,9 @@ def test_a_checkpoint_that_does_not_load_ends_the_run_with_its_cause(config: Con
 
 
 def test_agents_of_the_workers_need_no_server_for_a_sweep(config: Config) -> None:
-    plan = sweep(config)
-    driver, pool = Driver(plan, plan_jobs(plan.cases), Collected()), Pool(plan)
+    plan, server = sweep(config, url=None), Server()
+    driver, pool = Driver(plan, plan_jobs(plan.cases), Collected(), server), Pool(plan)
     run_all(driver, pool)
+    assert server.begun == []
     of_a = [name for name in pool.played if name.startswith("a")]
     assert of_a == ["a@10#0", "a@10#1", "a@20#0", "a@20#1"]

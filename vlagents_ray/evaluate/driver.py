@@ -79,6 +79,7 @@ class _Sweep:
     """The jobs of a policy whose checkpoints are not loaded yet."""
 
     policy: str
+    server: CheckpointSwaps | None  # None if the workers create agents with the checkpoints
     later: dict[int, list[Job]] = field(default_factory=dict)  # by step, in the order of the plan
     swapping_to: int | None = None  # the step that the server is loading
 
@@ -103,19 +104,21 @@ class Driver:
             plan: The plan of the jobs.
             jobs: The jobs; within each environment, they begin in this order.
             consumer: Receives the results.
-            swaps: Loads the checkpoints of a sweep into its server; None if the workers create
-                agents with the checkpoints themselves.
+            swaps: Loads the checkpoints of the policies with a `url` into their servers. Workers
+                create the agents of other policies with the checkpoints themselves.
         """
         self.queue = JobQueue()
-        self._swaps = swaps
         self._sweeps: dict[str, _Sweep] = {}
         for job in jobs:
-            policy, step = job.case.policy.name, job.case.checkpoint_step
+            policy, step = job.case.policy, job.case.checkpoint_step
             if step is None:
                 self.queue.put(job)
-            else:
-                sweep = self._sweeps.setdefault(policy, _Sweep(policy))
-                sweep.later.setdefault(step, []).append(job)
+                continue
+            sweep = self._sweeps.get(policy.name)
+            if sweep is None:
+                server = None if policy.url is None else swaps
+                sweep = self._sweeps[policy.name] = _Sweep(policy.name, server)
+            sweep.later.setdefault(step, []).append(job)
         self._retries = plan.retries
         self._abort_after = plan.abort_after
         self._consumer = consumer
@@ -160,10 +163,10 @@ class Driver:
             if is_busy or not sweep.later:
                 return
             sweep.swapping_to = next(iter(sweep.later))
-            if self._swaps is not None:
-                self._swaps.begin(sweep.policy, sweep.swapping_to)
+            if sweep.server is not None:
+                sweep.server.begin(sweep.policy, sweep.swapping_to)
 
-        if self._swaps is None or self._swaps.is_done(sweep.policy):
+        if sweep.server is None or sweep.server.is_done(sweep.policy):
             for job in sweep.later.pop(sweep.swapping_to):
                 self.queue.put(job)
             sweep.swapping_to = None

@@ -7,6 +7,7 @@ meanwhile, or that starts later, therefore gets the new step from Serve's contro
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from vlagents_ray.policies.base.checkpoint import CHECKPOINT_STEP
 from vlagents_ray.ray_tools import private
 from vlagents_ray.serve.launch.deployment_file import with_user_config
 from vlagents_ray.serve.launch.server import Server, last_message, load_failure
+
+log = logging.getLogger(__name__)
 
 # Time limit of a swap, s. Serve updates the replicas one after another, and may first have to
 # start a machine for a replica that was lost.
@@ -57,6 +60,7 @@ class ServedCheckpoints:
         self._swaps[policy] = _Swap(app, step, earlier, time.monotonic() + SWAP_S)
         changed = with_user_config(self._deployed, {CHECKPOINT_STEP: step}, app)
         if changed != self._deployed:
+            log.info("policy %r: loading %s %d", policy, CHECKPOINT_STEP, step)
             self._deployed = changed
             private.serve_client().deploy_apps(changed.for_serve())
 
