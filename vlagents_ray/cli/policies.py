@@ -269,7 +269,7 @@ def _served_on_ray(
     for policy in plan.policies:
         if policy.steps:
             step = {CHECKPOINT_STEP: policy.steps[0]}
-            deployed = with_user_config(deployed, step, applications[policy.name])
+            deployed = with_user_config(deployed, applications[policy.name], step)
     with running_server(deployed, address=address, num_cpus=cpus, ingress=False) as server:
         yield ServedCheckpoints(server, applications)
 

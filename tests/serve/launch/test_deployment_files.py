@@ -102,15 +102,15 @@ def test_every_shipped_deployment_file_is_valid(file: Path, tmp_path: Path) -> N
 
 def test_a_user_config_is_set_for_one_application_and_checked() -> None:
     both = together({name: deployment(STORED, config=STEPPED) for name in ("a", "b")})
-    changed = with_user_config(both, {"checkpoint_step": 2}, "b")
+    changed = with_user_config(both, "b", {"checkpoint_step": 2})
     assert [own_settings(app)["checkpoint_step"] for app in changed.applications] == [1, 2]
-    again = with_user_config(changed, {"scale": 3.0})
+    again = with_user_config(changed, "b", {"scale": 3.0})
     assert [own_settings(app) for app in again.applications] == [
-        STEPPED | {"scale": 3.0},
+        STEPPED,
         STEPPED | {"checkpoint_step": 2, "scale": 3.0},
     ]
     with pytest.raises(ConfigError, match="scales"):
-        with_user_config(both, {"scales": 3.0})
+        with_user_config(both, "b", {"scales": 3.0})
 
 
 def test_nothing_starts_without_keys_off_loopback_or_certificates_or_on_ipv6(

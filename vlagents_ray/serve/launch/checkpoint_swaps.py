@@ -58,7 +58,7 @@ class ServedCheckpoints:
         app = self._applications[policy]
         earlier = last_message(serve.status().applications[app])
         self._swaps[policy] = _Swap(app, step, earlier, time.monotonic() + SWAP_S)
-        changed = with_user_config(self._deployed, {CHECKPOINT_STEP: step}, app)
+        changed = with_user_config(self._deployed, app, {CHECKPOINT_STEP: step})
         if changed != self._deployed:
             log.info("policy %r: loading %s %d", policy, CHECKPOINT_STEP, step)
             self._deployed = changed

@@ -321,28 +321,23 @@ def with_settings(
     return _checked(changed.model_dump(exclude_unset=True), "settings", step_follows)
 
 
-def with_user_config(
-    config: Deployment, settings: Mapping[str, Any], app: str | None = None
-) -> Deployment:
-    """Return the deployment with these settings of its policies in `user_config`, which Serve can
+def with_user_config(config: Deployment, app: str, settings: Mapping[str, Any]) -> Deployment:
+    """Return the deployment with these settings of a policy in `user_config`, which Serve can
     change without new replicas.
 
     Args:
         config: The deployment.
+        app: The application of the policy.
         settings: The settings, which are added to the `user_config` in the file.
-        app: The application to change; None for all.
     """
     changed = config.model_copy(deep=True)
-    for application in our_apps(changed):
-        if app not in (None, application.name):
-            continue
-        options = next(
-            (options for options in application.deployments if options.get("name") == POLICY), None
-        )
-        if options is None:
-            options = {"name": POLICY}
-            application.deployments = [*application.deployments, options]
-        options["user_config"] = (options.get("user_config") or {}) | dict(settings)
+    [application] = [one for one in our_apps(changed) if one.name == app]
+    of_policy = [options for options in application.deployments if options.get("name") == POLICY]
+    if not of_policy:
+        of_policy = [{"name": POLICY}]
+        application.deployments = application.deployments + of_policy
+    options = of_policy[0]
+    options["user_config"] = (options.get("user_config") or {}) | dict(settings)
     return _checked(changed.model_dump(exclude_unset=True), "user_config")
 
 
