@@ -70,8 +70,9 @@ def test_batches_are_not_filled_so_far_that_the_first_robots_are_late() -> None:
     assert robots.pace.most_with_others == size < 16
 
 
-def test_a_robot_that_cannot_be_in_time_takes_no_share_of_the_others() -> None:
-    robots = Robots(*plans(RobotNeed(100.0, 1), 50), *plans(OF_50, 400, began=100.0))
+@pytest.mark.parametrize("greedy", [RobotNeed(100.0, 1), RobotNeed(1000.0, 80)])
+def test_a_robot_that_cannot_be_in_time_takes_no_share_of_the_others(greedy: RobotNeed) -> None:
+    robots = Robots(*plans(greedy, 50), *plans(OF_50, 400, began=100.0))
     assert not any(robots.read())
     assert robots.pace.load().in_time
 
@@ -131,3 +132,12 @@ def test_robots_that_have_gone_without_a_word_or_are_paused_do_not_count() -> No
     robots.read()
     assert not any(plan.waits_behind_others for plan in here)
     assert robots.pace.load().load == robots_load(PI0, {OF_50: 300}, 16).load < USABLE
+    assert not any(plan.waits_behind_others for plan in gone), "a robot that continues is first"
+
+
+def test_nothing_remains_of_a_fleet_that_was_too_large() -> None:
+    robots = Robots(*plans(OF_50, 600))
+    robots.read()
+    robots.plans = [RobotPlan(began=1000.0)]
+    robots.read()
+    assert (robots.pace.needed(), robots.pace.most_with_others) == (0.0, math.inf)

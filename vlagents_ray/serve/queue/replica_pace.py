@@ -223,17 +223,21 @@ class ReplicaPace:
         first.
         """
         now = self._clock()
-        plans = [plan for plan in self._plans() if plan.sends_slack and plan.is_present(now)]
+        plans: list[RobotPlan] = []
+        for plan in self._plans():
+            if plan.sends_slack and plan.is_present(now):
+                plans.append(plan)
+            else:
+                plan.waits_behind_others = False
         plans.sort(key=lambda plan: (plan.need is None, plan.began))
         known = Counter(plan.need for plan in plans if plan.need is not None)
+        self._robots, self._others = len(plans), 0
+        self._load, self.most_with_others = IDLE, math.inf
         curve = self._curve()
-        self._robots = len(plans)
         if curve is None:
-            self._load = IDLE
             return
         self._throughput_hz = self._max_batch_size / curve.cost_s(self._max_batch_size)
         if not known:
-            self._load = IDLE
             return
 
         # Until a robot's needs are known, it counts as the most frequent kind of robot, but does
@@ -244,8 +248,9 @@ class ReplicaPace:
         for index, plan in enumerate(plans):
             plan.waits_behind_others = index >= first and plan.need is not None
         self._load = self._load_of(needs[:first], curve)
-        self._others = max(0, known.total() - first)
-        self.most_with_others = self._load.batch_size if self._others else math.inf
+        if first < known.total():
+            self._others = known.total() - first
+            self.most_with_others = self._load.batch_size
 
     def _most_in_time(self, needs: Sequence[RobotNeed], curve: CostCurve) -> int:
         """Return how many of the first robots can be in time together."""
@@ -259,8 +264,8 @@ class ReplicaPace:
 
     def _load_of(self, needs: Sequence[RobotNeed], curve: CostCurve) -> RobotsLoad:
         """Return the load of robots. A robot that cannot be in time even alone does not count,
-        since it would make the load `inf`.
+        since it would make all other robots wait.
         """
-        soonest_s = answer_s(curve, 1, len(needs))
-        servable = Counter(need for need in needs if need.interval_s(soonest_s) > 0)
-        return robots_load(curve, servable, self._max_batch_size)
+        batch_s, soonest_s = curve.cost_s(1), answer_s(curve, 1, len(needs))
+        counts = Counter(need for need in needs if USABLE * need.interval_s(soonest_s) >= batch_s)
+        return robots_load(curve, counts, self._max_batch_size)
