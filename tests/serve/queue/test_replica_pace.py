@@ -125,7 +125,7 @@ def test_robots_that_have_gone_without_a_word_or_are_paused_do_not_count() -> No
     gone, here = plans(OF_50, 600), plans(OF_50, 300, began=1000.0)
     robots = Robots(*gone, *here)
     for plan in gone:
-        plan.heard = robots.now
+        plan.heard = plan.asked = robots.now
     assert True in robots.read()
 
     robots.now += 20.0
@@ -133,6 +133,20 @@ def test_robots_that_have_gone_without_a_word_or_are_paused_do_not_count() -> No
     assert not any(plan.waits_behind_others for plan in here)
     assert robots.pace.load().load == robots_load(PI0, {OF_50: 300}, 16).load < USABLE
     assert not any(plan.waits_behind_others for plan in gone), "a robot that continues is first"
+
+
+def test_a_robot_whose_request_waits_behind_others_still_counts() -> None:
+    robots = Robots(*plans(OF_50, 600))
+    robots.read()
+    for plan in robots.plans:
+        plan.heard, plan.asked = robots.now, robots.now - 5.0
+    robots.now += 30.0
+    for plan in robots.plans:
+        if not plan.waits_behind_others:
+            plan.heard = robots.now
+    waits = robots.read()
+    assert waits.count(True) > 150
+    assert waits == sorted(waits)
 
 
 def test_nothing_remains_of_a_fleet_that_was_too_large() -> None:

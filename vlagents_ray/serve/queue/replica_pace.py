@@ -22,6 +22,7 @@ from typing import Any
 
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.interface import SLACK
+from vlagents_ray.serve.queue.fair_queue import BEHIND_OTHERS_S
 from vlagents_ray.serve.queue.robots_load import (
     IDLE,
     USABLE,
@@ -56,7 +57,8 @@ class RobotPlan:
 
     need: RobotNeed | None = None  # None until the need is known
     heard: float = math.inf  # time at which the robot's last reset or act arrived, s; inf means now
-    asked: float = 0.0  # time at which the robot's last act arrived, s; 0.0 before the first act
+    # Time at which the robot's last answered act arrived, s; 0.0 before the first answer.
+    asked: float = 0.0
     # Time at which the robot begins to execute the rows of its last answer, s. If its rows had run
     # out, the time for which it stood still is skipped.
     begins: float = 0.0
@@ -83,7 +85,9 @@ class RobotPlan:
     def is_present(self, now: float) -> bool:
         """Return whether the robot has sent a request recently, at the time `now`, s."""
         rows_s = 0.0 if self.need is None else self.need.longest_s
-        return now - self.heard <= _PRESENT_S + rows_s
+        has_request = self.heard > self.asked  # which is not answered yet
+        waits_s = BEHIND_OTHERS_S if self.waits_behind_others and has_request else 0.0
+        return now - self.heard <= _PRESENT_S + rows_s + waits_s
 
     def observe(self, rows: int, arrived: float, needed: float, now: float) -> None:
         """Update the needs of the robot from an act.
