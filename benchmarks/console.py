@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,22 +13,12 @@ from rich.text import Text
 from vlagents_ray.cli.console import out, table
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.overrides import parse_settings
 
 Calls = Annotated[int, typer.Option(min=1, help="Number of round trips for each client.")]
 Seconds = Annotated[float, typer.Option(min=0.1, help="Duration of each measurement, in seconds.")]
 Rounds = Annotated[int, typer.Option(min=1)]
 Out = Annotated[Path | None, typer.Option("--out", help="File for the figures, as JSON.")]
-StateDims = Annotated[
-    list[str],
-    typer.Option(
-        "--state-dim",
-        metavar="PART=N",
-        help="Number of values in a part of the state, if the policy does not declare it.",
-    ),
-]
 Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma; default: all.")]
-_MOST_DIMS = 1_000_000  # maximum number of values in a part of the state
 # Maximum number of ratios in a row that fit on a screen with their intervals; the file of figures
 # has all ratios.
 _WITH_INTERVALS = 5
@@ -123,29 +113,6 @@ def parse_counts(text: str, option: str) -> list[int]:
     if not counts or counts[0] < 1:
         raise ConfigError(f"{option}: expected numbers from 1 on, got {text!r}")
     return counts
-
-
-def parse_dims(texts: Iterable[str], option: str) -> dict[str, int]:
-    """Parse the sizes of parts of the state.
-
-    Args:
-        texts: The texts, PART=N.
-        option: The name of the option, for errors.
-
-    Returns:
-        The number of values in each part.
-
-    Raises:
-        ConfigError: A size is not a whole number above 0.
-    """
-    dims = parse_settings(texts, option)
-    for number in dims.values():
-        if type(number) is not int or not 1 <= number <= _MOST_DIMS:
-            raise ConfigError(
-                f"{option}: expected a whole number from 1 to {_MOST_DIMS} for each part, got "
-                f"{dims}"
-            )
-    return dims
 
 
 def save(found: Any, file: Path | None) -> None:

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Out, Rounds, Seconds, StateDims, parse_counts, parse_dims, save
+from benchmarks.console import Out, Rounds, Seconds, parse_counts, save
 from benchmarks.figures import measured_on
 from benchmarks.measured_policy import (
     MeasuredPolicy,
@@ -39,9 +39,12 @@ from vlagents_ray.cli.options import (
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent, Obs
+from vlagents_ray.overrides import parse_settings
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.testing import random_observation
+
+_MOST_DIMS = 1_000_000  # maximum number of values in a part of the state
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +175,14 @@ def main(
             min=1, help="Width and height of images in pixels, if the policy accepts any size."
         ),
     ] = 224,
-    state: StateDims = [],  # noqa: B006
+    state: Annotated[
+        list[str],
+        typer.Option(
+            "--state-dim",
+            metavar="PART=N",
+            help="Number of values in a part of the state, if the policy does not declare it.",
+        ),
+    ] = [],  # noqa: B006
     settings: Set = [],  # noqa: B006
     serve_settings: ServeSet = [],  # noqa: B006
     config_dir: ConfigDir = None,
@@ -190,10 +200,32 @@ def main(
         application = policy_application(find_policy(file, config_dir), app, overrides)
         args = ServerArgs(**application.args)
         batches = parse_counts(batch, "--batch")
-        plan = PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state-dim"))
+        plan = PolicyPlan(args, batches, seconds, rounds, image, _parse_dims(state))
         found = measure_policy(plan, progress)
     show_policy(found)
     save({**origin, **found}, out_file)
+
+
+def _parse_dims(texts: Sequence[str]) -> dict[str, int]:
+    """Parse the sizes of parts of the state.
+
+    Args:
+        texts: The texts, PART=N.
+
+    Returns:
+        The number of values in each part.
+
+    Raises:
+        ConfigError: A size is not a whole number above 0.
+    """
+    dims = parse_settings(texts, "--state-dim")
+    for number in dims.values():
+        if type(number) is not int or not 1 <= number <= _MOST_DIMS:
+            raise ConfigError(
+                f"--state-dim: expected a whole number from 1 to {_MOST_DIMS} for each part, got "
+                f"{dims}"
+            )
+    return dims
 
 
 def show_policy(found: Mapping[str, Any]) -> None:

@@ -51,8 +51,6 @@ from vlagents_ray.serve.launch.server import running_server
 DEFAULT_TRANSPORTS = ("plasma", "handle", "shm", "websocket")
 BASE_MS, PER_ITEM_MS = 20.0, 1.0
 SLOW_NOOP = ("noop", {"base_ms": BASE_MS, "per_item_ms": PER_ITEM_MS})
-# Settings of a policy for which a batch is no faster.
-WITHOUT_GAIN = {"base_ms": 0.0, "per_item_ms": 5.0}
 _PROCESSES = 4  # number of processes that share the clients, in addition to the robot's process
 _WARM_S = 0.5
 _LATE_S = 60.0
