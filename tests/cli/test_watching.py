@@ -140,6 +140,16 @@ def test_a_step_is_not_missed_before_the_first_checkpoint_is_there_and_its_first
     assert own_settings(parts["swept"].applications[0])["checkpoint_step"] == 30
 
 
+@pytest.mark.parametrize("address", ["url", "source"])
+def test_steps_of_a_running_server_are_refused_with_the_cure(address: str, tmp_path: Path) -> None:
+    policy = {"name": "remote", address: "http://127.0.0.1:9", "steps": [10, 20]}
+    config = EvalConfig.model_validate(
+        {"policies": [policy], "suites": [{"envs": ["tabletop"]}], "out": tmp_path}
+    )
+    with pytest.raises(ConfigError, match=r"which has one checkpoint, .* give its `source`"):
+        resolve_policies(config)
+
+
 @pytest.mark.parametrize("place", ["evaluation", "deployment"])
 def test_of_the_settings_only_a_step_that_is_swept_may_be_missing(
     place: str, tmp_path: Path

@@ -267,9 +267,12 @@ def test_what_a_cluster_is_missing_is_repeated_until_it_is_there(
     monkeypatch.setattr(server, "_REMIND_S", 0.0)
     missing = iter(["a GPU", "a GPU", None])
     states = iter(["DEPLOYING", "DEPLOYING", "DEPLOYING", "RUNNING"])
-    client = SimpleNamespace(
-        status=lambda: SimpleNamespace(applications={"a": SimpleNamespace(status=next(states))})
-    )
+
+    def status() -> SimpleNamespace:
+        app = SimpleNamespace(status=next(states), message="", deployments={})
+        return SimpleNamespace(applications={"a": app})
+
+    client = SimpleNamespace(status=status)
     monkeypatch.setattr(server, "_http_reason", lambda _: None)
     server.wait_until_ready(client, {"a": "url"}, ["a"], float("inf"), lambda: next(missing))
     assert [record.getMessage() for record in caplog.records] == ["waiting: a GPU"] * 2

@@ -101,8 +101,8 @@ def changed(was: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> s
     """Return the field of a policy's identity that differs between two metadata of its server; None
     if no field differs.
 
-    In a sweep (`swept`), each session chooses a checkpoint, so the server's default checkpoint is
-    not compared.
+    In a sweep (`swept`), the server has one checkpoint after another, so checkpoints are not
+    compared.
     """
     for field in IDENTITY[: 1 if swept else 2]:
         if was.get(field) != now.get(field):
