@@ -10,10 +10,11 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
@@ -257,3 +258,39 @@ def test_a_policy_that_ends_the_process_fails_its_episode_only(config: Config) -
     assert errors
     assert all("os._exit(0) was called (test_in_process.py:" in error for error in errors)
     assert os._exit is before
+
+
+class OneAtATime(ToZero):
+    """A policy that fails if another one is in memory when it is loaded."""
+
+    alive: ClassVar[weakref.WeakSet[OneAtATime]] = weakref.WeakSet()
+    events: ClassVar[list[str]] = []
+
+    def __init__(self, checkpoint_step: int) -> None:
+        super().__init__()
+        self.step = checkpoint_step
+        # A reference cycle, as in real policies: only garbage collection frees the policy.
+        self.itself = self
+
+    def initialize(self) -> None:
+        assert len(self.alive) == 0
+        self.alive.add(self)
+        self.events.append(f"load {self.step}")
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.events.append(f"reset {self.step}")
+        return super().reset(obs, instruction, **kwargs)
+
+    def close(self) -> None:
+        self.events.append(f"close {self.step}")
+
+
+def test_a_checkpoint_is_closed_and_freed_before_the_next_one_is_loaded(config: Config) -> None:
+    OneAtATime.events.clear()
+    summary = evaluate(config(episodes=2, steps=[10, 20], workers=0), agent_factory=OneAtATime)
+    assert summary.total.episodes == 4
+    assert OneAtATime.events == [
+        event
+        for step in (10, 20)
+        for event in (f"load {step}", f"reset {step}", f"reset {step}", f"close {step}")
+    ]
