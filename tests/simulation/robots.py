@@ -1,9 +1,10 @@
 """Robots that share one policy in virtual time, with the real queue and the real pace of its
 replica.
 
-`python -m tests.simulation.robots --seeds 100000` runs random worlds, and checks each; `python -m
-tests.simulation.robots --fleets` prints the largest fleets in time, and the robots in time of smaller
-and larger fleets: without slack, with the order by slack, and with the pace as well.
+`PYTHONPATH=tests/support python -m tests.simulation.robots --seeds 100000` runs random worlds, and
+checks each. With `--fleets` in place of `--seeds`, it prints the largest fleets in time, and the
+robots in time of smaller and larger fleets: without slack, with the order by slack, and with the
+pace as well.
 """
 
 from __future__ import annotations
@@ -401,32 +402,30 @@ def print_starts() -> None:
             )
 
 
-# The ways to serve robots: without slack, with the order by slack, and with the pace as well.
-WAYS = {
-    "no slack": {"slack": False, "obeys": True},
-    "slack": {"slack": True, "obeys": False},
-    "slack and pace": {"slack": True, "obeys": True},
-}
+# The ways to serve robots: whether the queue uses their slack, and whether they obey the pace.
+WAYS = {"no slack": (False, True), "slack": (True, False), "slack and pace": (True, True)}
 
 
 def print_fleets() -> None:
-    """Print the largest fleets in time, and the robots in time of smaller and larger fleets."""
-    print("of 100 %: the largest fleet with slack and pace")
-    print("fleet          way             largest  in time at 70 %  at 105 %  at 125 %")
+    """Print the largest fleets in time, and the robots in time of smaller and larger fleets. Their
+    sizes are shares of the largest fleet with slack and pace.
+    """
+    print("fleet          way             largest  in time of 70 %, 105 %, 125 %")
     for name, kinds in {
         "8 rows": [(8, 10.0)],
         "50 and 8 rows": [(50, 10.0), (8, 10.0)],
         "50 rows": [(50, 10.0)],
     }.items():
-        most = largest(PI0, True, *kinds)
-        for way, options in WAYS.items():
+        most = {
+            way: largest(PI0, slack, *kinds, obeys=obeys) for way, (slack, obeys) in WAYS.items()
+        }
+        for way, (slack, obeys) in WAYS.items():
             in_time = []
             for part in (0.7, 1.05, 1.25):
-                number = round(part * most)
-                world = play(PI0, number, options["slack"], *kinds, obeys=options["obeys"])
+                number = round(part * most["slack and pace"])
+                world = play(PI0, number, slack, *kinds, obeys=obeys)
                 in_time.append(f"{world.in_time()} of {number}")
-            found = largest(PI0, options["slack"], *kinds, obeys=options["obeys"])
-            print(f"{name:14} {way:15} {found:7}  {'  '.join(in_time)}", flush=True)
+            print(f"{name:14} {way:15} {most[way]:7}  {', '.join(in_time)}", flush=True)
 
 
 def drawn(seed: int) -> World:
@@ -463,8 +462,8 @@ def play_drawn(seed: int) -> World:
         world.check_all_answered()
     except AssertionError as error:
         raise AssertionError(
-            f"seed {seed}: {error}\nagain: python -m tests.simulation.robots --first {seed} "
-            "--seeds 1"
+            f"seed {seed}: {error}\nagain: PYTHONPATH=tests/support python -m "
+            f"tests.simulation.robots --first {seed} --seeds 1"
         ) from error
     return world
 

@@ -1,8 +1,8 @@
 """Robots that share a policy in virtual time: properties that hold for every seed, and the number
 of robots in time.
 
-`python -m tests.simulation.robots --seeds 100000` runs more seeds, and `--fleets` prints the
-largest fleets.
+`PYTHONPATH=tests/support python -m tests.simulation.robots --seeds 100000` runs more seeds, and
+`--fleets` prints the largest fleets.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def test_slack_and_pace_serve_more_robots_than_slack_and_these_more_than_none(
     for part in (0.7, 1.05, 1.25):
         number = round(part * most)
         no_slack, no_pace, both = (
-            play(PI0, number, way["slack"], *kinds, obeys=way["obeys"]).in_time()
-            for way in WAYS.values()
+            play(PI0, number, slack, *kinds, obeys=obeys).in_time()
+            for slack, obeys in WAYS.values()
         )
         assert both >= max(no_slack, no_pace), part
         assert both >= 0.9 * min(number, most), part

@@ -71,8 +71,8 @@ class ClientLocation:
 
 
 def choose_replica(loads: Sequence[ReplicaLoad], location: ClientLocation) -> ReplicaLoad | None:
-    """Return the replica near the client with the fewest sessions, or the one of all replicas if
-    that has clearly fewer sessions.
+    """Return the replica with the fewest sessions near the client. If another replica has clearly
+    fewer sessions, return the replica with the fewest sessions of all.
 
     Among equally loaded replicas, the first is chosen. The result is None if no replica accepts
     sessions, or if the client needs a near replica and there is none.
