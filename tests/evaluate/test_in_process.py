@@ -287,10 +287,13 @@ class OneAtATime(ToZero):
 
 def test_a_checkpoint_is_closed_and_freed_before_the_next_one_is_loaded(config: Config) -> None:
     OneAtATime.events.clear()
-    summary = evaluate(config(episodes=2, steps=[10, 20], workers=0), agent_factory=OneAtATime)
-    assert summary.total.episodes == 4
+    plan = config(episodes=2, steps=[10, 20], workers=0)
+    assert evaluate(plan, agent_factory=OneAtATime).total.episodes == 4
+    # The next round of `--watch` is another evaluation with the same results.
+    plan = config(episodes=2, steps=[30], workers=0, resume=True, out=plan.out.with_name("later"))
+    assert evaluate(plan, agent_factory=OneAtATime).total.episodes == 2
     assert OneAtATime.events == [
         event
-        for step in (10, 20)
+        for step in (10, 20, 30)
         for event in (f"load {step}", f"reset {step}", f"reset {step}", f"close {step}")
     ]

@@ -253,9 +253,9 @@ class Rollout:
         process never has two checkpoints in memory.
         """
         self._set_phase("connect", 0)
-        if self._agent is not None:
-            self._drop_agent()
-            free_memory()
+        self._drop_agent()
+        if case.checkpoint_step is not None:
+            free_memory()  # an agent with the previous checkpoint may be garbage by now
         if self._broken_agents:  # the server may be restarting or full
             sleep(min(FIRST_WAIT_S * 2 ** (self._broken_agents - 1), LONGEST_WAIT_S))
 
