@@ -20,7 +20,7 @@ import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
 from in_process_evaluation import flat_config
 
-from vlagents_ray import Act, Obs
+from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate, run
 from vlagents_ray.evaluate.episode.failures import Failure
@@ -30,6 +30,8 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers import in_process, rollout
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.local_agent import LocalPolicy
 from vlagents_ray.signals import StopRequest
 
 Config = Callable[..., EvalConfig]
@@ -263,7 +265,7 @@ def test_a_policy_that_ends_the_process_fails_its_episode_only(config: Config) -
 class OneAtATime(ToZero):
     """A policy that fails if another one is in memory when it is loaded."""
 
-    alive: ClassVar[weakref.WeakSet[OneAtATime]] = weakref.WeakSet()
+    loaded: ClassVar[weakref.WeakSet[OneAtATime]] = weakref.WeakSet()
     events: ClassVar[list[str]] = []
 
     def __init__(self, checkpoint_step: int) -> None:
@@ -273,8 +275,8 @@ class OneAtATime(ToZero):
         self.itself = self
 
     def initialize(self) -> None:
-        assert len(self.alive) == 0
-        self.alive.add(self)
+        assert len(self.loaded) == 0
+        self.loaded.add(self)
         self.events.append(f"load {self.step}")
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -285,13 +287,22 @@ class OneAtATime(ToZero):
         self.events.append(f"close {self.step}")
 
 
-def test_a_checkpoint_is_closed_and_freed_before_the_next_one_is_loaded(config: Config) -> None:
+def local_policy(checkpoint_step: int) -> LocalPolicy:
+    """Return the policy as `vlagents-ray eval` runs it in this process."""
+    args = ServerArgs(policy=f"{__name__}:OneAtATime")
+    return LocalPolicy(args, {"checkpoint_step": checkpoint_step})
+
+
+@pytest.mark.parametrize("make", [OneAtATime, local_policy])
+def test_a_checkpoint_is_closed_and_freed_before_the_next_one_is_loaded(
+    config: Config, make: Callable[..., Agent]
+) -> None:
     OneAtATime.events.clear()
     plan = config(episodes=2, steps=[10, 20], workers=0)
-    assert evaluate(plan, agent_factory=OneAtATime).total.episodes == 4
-    # The next round of `--watch` is another evaluation with the same results.
-    plan = config(episodes=2, steps=[30], workers=0, resume=True, out=plan.out.with_name("later"))
-    assert evaluate(plan, agent_factory=OneAtATime).total.episodes == 2
+    assert evaluate(plan, agent_factory=make).total.episodes == 4
+    # The next round of `--watch` is another evaluation.
+    plan = config(episodes=2, steps=[30], workers=0, out=plan.out.with_name("later"))
+    assert evaluate(plan, agent_factory=make).total.episodes == 2
     assert OneAtATime.events == [
         event
         for step in (10, 20, 30)

@@ -416,3 +416,16 @@ def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Pat
         versions.append(engine.model.version)
         engine.close()
     assert versions[0] == versions[1] != versions[2]
+
+
+def test_the_facts_of_a_model_stay_known_after_the_engine_is_closed(
+    serving: Callable[..., Engine], library: Library
+) -> None:
+    """Parts of a replica close after the engine: a recording still writes its metadata."""
+    library.joints = {"a/1": 3}
+    engine = serving()
+    contract = engine.contract
+    assert contract is not None
+    engine.close()
+    assert library.closed == ["a/1"]
+    assert (engine.contract, engine.model.checkpoint) == (contract, "a/1")

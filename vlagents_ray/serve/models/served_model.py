@@ -90,8 +90,10 @@ class ServedModel:
         free_memory()
 
     def close(self) -> None:
-        """Close the model, unless its running batch does not end."""
-        model, self._loaded = self._loaded, None
+        """Close the model, unless its running batch does not end. Its facts stay known, for the
+        parts that close after the engine.
+        """
+        model = self._loaded
         if model is not None:
             model.close(_CLOSE_S)
 
