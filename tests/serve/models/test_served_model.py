@@ -427,5 +427,6 @@ def test_the_facts_of_a_model_stay_known_after_the_engine_is_closed(
     contract = engine.contract
     assert contract is not None
     engine.close()
-    assert library.closed == ["a/1"]
+    engine.close()
+    assert library.closed == ["a/1"], "closed once"
     assert (engine.contract, engine.model.checkpoint) == (contract, "a/1")

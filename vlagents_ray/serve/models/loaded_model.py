@@ -216,8 +216,8 @@ class LoadedModel:
         return len(padding)
 
     def close(self, wait_s: float = -1.0) -> None:
-        """Close the agent after the running batch. The agent's memory is freed when no reference to
-        the agent remains.
+        """Close the agent after the running batch, once. The agent's memory is freed when no
+        reference to the agent remains.
 
         If the batch is still running after `wait_s` (-1: no limit), the agent stays open until this
         process ends.
@@ -226,9 +226,10 @@ class LoadedModel:
             logger.error("the policy is still busy after %g s; it is not closed", wait_s)
             return
         try:
-            self.closed = True
-            with self.call("close"):
-                _close_agent(self.agent)
+            if not self.closed:
+                self.closed = True
+                with self.call("close"):
+                    _close_agent(self.agent)
         finally:
             self.busy.release()
 
