@@ -1,3 +1,3 @@
-"""Loaded checkpoints: copies of the agent, the cache of models, and padding to compiled batch
-sizes.
+"""The model of a replica: its loading and replacement, copies of the agent, and padding to compiled
+batch sizes.
 """
