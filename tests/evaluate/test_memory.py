@@ -31,11 +31,16 @@ class Held(Progress):
             gc.collect()
             print(tracemalloc.get_traced_memory()[0])
 
+def play(episodes, out, progress):
+    config = flat_config(
+        envs=[LINE], episodes=episodes, workers=0, video="none", policy="to zero", out=out
+    )
+    evaluate(config, agent_factory=ToZero, progress=progress)
+
+# A short evaluation loads all modules: some are loaded only after a while, or at the end.
+play(2, out + "/short", Progress())
 tracemalloc.start()
-config = flat_config(
-    envs=[LINE], episodes=episodes, workers=0, video="none", policy="to zero", out=out
-)
-evaluate(config, agent_factory=ToZero, progress=Held())
+play(episodes, out + "/long", Held())
 """
 
 

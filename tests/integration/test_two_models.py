@@ -42,7 +42,9 @@ def test_the_program_does_its_task_with_both_models(
 def test_a_planner_that_ends_leaves_the_policy_its_subtask_and_then_the_robot_holds(
     server: Server,
 ) -> None:
-    """The planner ends after 3 s of 9 s, and its last answer may be used for 3 s."""
+    """The planner ends after 3 s of 12 s, and its last answer may be used for 3 s. On a busy machine
+    its end takes some more seconds.
+    """
     from ray import serve
 
     planner = RemoteAgent(f"{server.url}/planner", timeout_s=2)
@@ -52,7 +54,7 @@ def test_a_planner_that_ends_leaves_the_policy_its_subtask_and_then_the_robot_ho
     with player, two_models.GuidedArm(planner, max_age_s=3.0) as arm:
         down.start()
         try:
-            report = run_loop(arm, player, hz=10, seconds=9)
+            report = run_loop(arm, player, hz=10, seconds=12)
         finally:
             down.join()
     assert re.match(r"the planner's answer is \S+ s old: .*planner", report.reasons["robot"])
