@@ -236,8 +236,9 @@ def test_a_robots_loop_reports_the_ticks_that_it_missed_while_it_waited_for_a_ch
     monkeypatch.setattr(modeling_vlagents, "time", clock)
     for _ in range(6):
         made.select_action(batch(1))
-    [times] = server.engine.sessions.times()
-    assert (times.ticks, times.starved) == (7, 3)
+    [session] = server.engine.sessions.all()
+    assert session.times is not None
+    assert session.times.lately(server.engine.clock())[:2] == (7, 3)
 
 
 def test_threads_that_share_a_policy_have_sessions_of_their_own(

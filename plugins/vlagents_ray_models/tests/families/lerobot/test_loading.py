@@ -111,7 +111,7 @@ def step(added: dict[str, Any]) -> Change:
         (settings(type="unheard_of"), "unheard_of"),
         (settings(of_another_version=1), f"venv create lerobot{'' if tiny.NEW else '06'}`"),
         (settings(chunk_size="many"), "chunk_size"),
-        (settings(use_peft=True), "merge_and_unload"),
+        (settings(use_peft=True), "`adapter` to this folder"),
         (settings(dim_model=64), "cannot load"),
         (
             step({"class": "subprocess.Popen", "config": {"args": ["/bin/true"]}}),

@@ -116,7 +116,7 @@ def test_the_names_of_the_joints_are_those_of_the_training(
     model = policy.model
     # As LeRobot 0.6 saves it.
     monkeypatch.setattr(model.sampler.config, "action_feature_names", names, raising=False)
-    described = policy._describe(model.sampler, model.processors, model.trained, {})
+    described = policy._describe(model.sampler, model.processors, model.trained)
     assert described.contract.action.names == tuple(names)
     assert policy.contract.action.names is None
 
