@@ -47,7 +47,7 @@ _USE_NO_SESSION = ("close", *BACKGROUND_OPS)
 
 @dataclass(frozen=True, slots=True)
 class ReceivedReport:
-    """What a robot reports with a request that is not answered yet."""
+    """The report of a robot in a request that is not answered yet."""
 
     report: RobotReport
     times: RobotTimes  # of the robot's session
