@@ -29,6 +29,7 @@ from vlagents_ray.datasets.episode import (
     INTERVENTION_COLUMN,
     SAFE_COLUMN,
     STATE,
+    TICK_COLUMN,
 )
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images import jpeg_png
@@ -169,7 +170,7 @@ class RecordedDataset:
         """Return the number of calls that are missing within an episode of a server's recording."""
         if not self.traced:
             return 0
-        ticks = np.array(self.columns(episode, ["tick"])["tick"])
+        ticks = np.array(self.columns(episode, [TICK_COLUMN])[TICK_COLUMN])
         return int((np.diff(ticks) - 1).clip(0).sum())
 
     def steps(

@@ -26,6 +26,7 @@ from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import SAFE
 from vlagents_ray.robot import Guard, MotionLimits
+from vlagents_ray.robot.record import Recorder
 
 HZ = 50.0
 SPEED, ACCELERATION, JERK = 1.0, 20.0, 800.0
@@ -376,6 +377,53 @@ def demonstrations(spec: ActionSpec, seed: int) -> list[np.ndarray]:
         actions[:, deltas] = moved[:, deltas]
         episodes.append(actions.astype(np.float32))
     return episodes
+
+
+def missing_ticks(random: np.random.Generator, ticks: int) -> np.ndarray:
+    """Return for each tick whether a recorder misses it: single frames that it drops, and pauses
+    and takeovers of up to two seconds.
+    """
+    is_missing = random.random(ticks) < random.choice([0.002, 0.01, 0.1, 0.4])
+    for begin in random.integers(0, ticks, random.integers(0, 4)):
+        is_missing[begin : begin + random.integers(2, 2 * HZ)] = True
+    is_missing[:3] = False  # an episode begins at rest
+    return is_missing
+
+
+@pytest.mark.parametrize(("delta", "arms"), KINDS)
+@pytest.mark.parametrize("seed", range(4))
+def test_limits_of_a_recording_with_gaps_are_those_of_the_recording_without(
+    tmp_path: Path, delta: bool, arms: int | None, seed: int
+) -> None:
+    spec = spec_of(delta, arms)
+    episodes = demonstrations(spec, seed)
+    complete = MotionLimits.read(recorded(tmp_path / "complete", spec, episodes))
+
+    random = np.random.default_rng(seed)
+    root = tmp_path / "with_gaps"
+    with Recorder(root, HZ, frames=10_000) as recorder:
+        for actions in episodes:
+            is_missing = missing_ticks(random, len(actions))
+            with recorder.episode("stack"):
+                for tick in np.flatnonzero(~is_missing):
+                    obs = Obs(state={"joints": np.zeros(1, np.float32)})
+                    recorder.add(obs, actions[tick], tick=int(tick))
+
+    with_gaps = MotionLimits.read(root, spec)
+    for name in ("velocity", "acceleration", "jerk"):
+        limits = np.asarray(getattr(with_gaps, name))
+        # A gripper that did not move in the frames that were kept has no limit.
+        limits[np.isinf(limits)] = 0.0
+        assert (limits <= 1.5 * np.asarray(getattr(complete, name))).all(), name
+
+
+def test_a_recording_of_single_frames_gives_no_limits(tmp_path: Path) -> None:
+    with Recorder(tmp_path, HZ, frames=1000) as recorder, recorder.episode("stack"):
+        for tick in range(0, 200, 2):
+            obs = Obs(state={"joints": np.zeros(1, np.float32)})
+            recorder.add(obs, np.full(2, tick / 200, np.float32), tick=tick)
+    with pytest.raises(ConfigError, match="expected 2 frames at consecutive ticks, got at most 1"):
+        MotionLimits.read(tmp_path)
 
 
 def require_accepted(guard: Guard, actions: np.ndarray) -> None:

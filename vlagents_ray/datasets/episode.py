@@ -22,10 +22,10 @@ from vlagents_ray.naming import distinct
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 ENVIRONMENT = "observation.environment_state"
-SAFE_COLUMN = "safe"
+TICK_COLUMN, SAFE_COLUMN = "tick", "safe"
 MOMENTS = {  # names of further columns of each recorded frame
     "captured_at": "float64",  # time of the frame, s since 1970
-    "tick": "int64",  # tick of the control loop; gaps are missed or dropped frames
+    TICK_COLUMN: "int64",  # tick of the control loop; gaps are missed or dropped frames
     SAFE_COLUMN: "bool",  # whether the action is a safe action instead of the policy's action
 }
 WANTED_ACTION, INTERVENTION_COLUMN = "policy_action", "intervention"
@@ -126,7 +126,7 @@ class RunningEpisode:
         frame: dict[str, Any] = {
             ACTION: np.asarray(action, np.float32),
             "captured_at": captured_at,
-            "tick": tick,
+            TICK_COLUMN: tick,
             SAFE_COLUMN: safe,
             **more,
         }

@@ -16,6 +16,7 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec
 from vlagents_ray.dataset_contract import INFO, DatasetContract
+from vlagents_ray.datasets.episode import TICK_COLUMN
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.naming import did_you_mean, without_duplicate_keys
 from vlagents_ray.registry import require
@@ -200,27 +201,35 @@ class MotionLimits:
             action = DatasetContract.from_json(info[INFO]).contract.action
 
         fps = float(info["fps"])
-        actions_of_episodes = _dataset_actions(folder)
-        if not actions_of_episodes:
+        sections = _dataset_sections(folder)
+        if not sections:
             raise ConfigError("expected at least one frame in data/, got none")
 
-        actions = np.concatenate(actions_of_episodes)
+        actions = np.concatenate([section.actions for section in sections])
         tolerance = _TOLERANCE * np.ptp(actions, axis=0)
         deltas = (action or ActionSpec()).delta_columns(actions.shape[1])
-        paths = [_path(episode, deltas) for episode in actions_of_episodes]
+        paths = [_path(section, deltas) for section in sections]
 
         def fastest(order: int) -> tuple[float, ...]:
             """Return a limit of the paths' differences of order `order`, in units and seconds."""
-            changes = [np.abs(np.diff(path, order, axis=0)) for path in paths if len(path) > order]
-            if not changes:
-                return tuple([math.inf] * actions.shape[1])
+            changes = [np.abs(np.diff(path, order, axis=0)) for path in paths]
+            frames = np.concatenate(changes)
+            if not len(frames):
+                raise ConfigError(
+                    f"expected {order + 1} frames at consecutive ticks, got at most "
+                    f"{max(map(len, paths))}; the recorder dropped the frames between (see the "
+                    "column `tick`): record again, at a lower rate or with smaller images"
+                )
 
-            limit: np.ndarray = np.quantile(np.concatenate(changes), QUANTILE, axis=0)
+            limit: np.ndarray = np.quantile(frames, QUANTILE, axis=0)
             # A motion of deltas begins at rest. The frames at its beginning are too few to affect
             # the quantile of all frames, so they have their own quantile.
-            if deltas:
-                starts = np.stack([episode[:order].max(0) for episode in changes])
-                start_limit = np.quantile(starts, QUANTILE, axis=0, method="higher")
+            starts = []
+            for section, section_changes in zip(sections, changes, strict=True):
+                if deltas and section.begins_episode:
+                    starts.append(section_changes[:order].max(0))
+            if starts:
+                start_limit = np.quantile(np.stack(starts), QUANTILE, axis=0, method="higher")
                 limit = np.maximum(limit, start_limit)
             limit *= MARGIN * fps**order
             # A gripper that rarely moves has the quantile 0, but a limit of 0 would never let it
@@ -395,22 +404,33 @@ def _three(text: str) -> list[float]:
     return [x, y, z]
 
 
-def _path(actions: np.ndarray, deltas: list[int]) -> np.ndarray:
-    """Return the path of an episode. The differences of the path are speeds, even if the actions
+class _Section(NamedTuple):
+    """Actions of an episode at consecutive ticks.
+
+    A tick without a frame ends a section: the frame was dropped, or the robot was paused. The
+    action of that tick is unknown, so the actions around it do not contain the speed.
+    """
+
+    actions: np.ndarray  # (T, D)
+    begins_episode: bool  # whether the first action is the episode's first, which begins at rest
+
+
+def _path(section: _Section, deltas: list[int]) -> np.ndarray:
+    """Return the path of a section. The differences of the path are speeds, even if the actions
     are deltas.
 
     Args:
-        actions: The actions of the episode, (T, D).
+        section: The section, with T actions of D numbers.
         deltas: The indices of the relative numbers.
 
     Returns:
-        The actions, (T, D). If there are deltas, the result is the cumulative sum of the deltas,
-        which begins at rest, (T + 3, D).
+        The actions, (T, D). If there are deltas, the result is the cumulative sum of the deltas;
+        at the beginning of an episode it begins at rest, (T + 3, D).
     """
-    if not deltas:
-        return actions
-    path = actions.copy()
+    path = section.actions.copy()
     path[:, deltas] = np.cumsum(path[:, deltas], axis=0)
+    if not deltas or not section.begins_episode:
+        return path
     before = path[:1].copy()
     before[:, deltas] = 0.0
     return np.concatenate([before, before, before, path])
@@ -446,18 +466,34 @@ def _value(key: str, value: Any) -> Any:
     return tuple(unlimited if number is None and key != "rest" else number for number in value)
 
 
-def _dataset_actions(folder: Path) -> list[np.ndarray]:
-    """Return the actions of each episode of a LeRobotDataset, (T, D) each."""
+def _dataset_sections(folder: Path) -> list[_Section]:
+    """Return the sections of all episodes of a LeRobotDataset, in their order.
+
+    A dataset without the column `tick`, such as one that LeRobot recorded, has no gaps.
+    """
     parquet = require("pyarrow.parquet", extra="record")
     rows_of_episodes: dict[int, list[np.ndarray]] = {}
+    ticks_of_episodes: dict[int, list[np.ndarray]] = {}
     for file in sorted(folder.glob("data/*/*.parquet")):
-        table = parquet.read_table(file, columns=["action", "episode_index"])
+        available = parquet.read_schema(file).names
+        columns = [name for name in ("action", "episode_index", TICK_COLUMN) if name in available]
+        table = parquet.read_table(file, columns=columns)
         rows = np.array(table["action"].to_pylist(), np.float64)
         rows = rows.reshape(len(rows), -1)  # LeRobot stores an action of one number as a scalar
+        ticks = table[TICK_COLUMN].to_numpy() if TICK_COLUMN in available else np.arange(len(rows))
         episodes = table["episode_index"].to_numpy()
         for episode in np.unique(episodes):
-            rows_of_episodes.setdefault(int(episode), []).append(rows[episodes == episode])
-    return [np.concatenate(rows) for rows in rows_of_episodes.values()]
+            is_of_episode = episodes == episode
+            rows_of_episodes.setdefault(int(episode), []).append(rows[is_of_episode])
+            ticks_of_episodes.setdefault(int(episode), []).append(ticks[is_of_episode])
+
+    sections = []
+    for episode, rows_of_files in rows_of_episodes.items():
+        ticks = np.concatenate(ticks_of_episodes[episode])
+        gaps = np.flatnonzero(np.diff(ticks) != 1) + 1
+        for number, actions in enumerate(np.split(np.concatenate(rows_of_files), gaps)):
+            sections.append(_Section(actions, begins_episode=number == 0))
+    return sections
 
 
 def _document(path: Path) -> Any:
