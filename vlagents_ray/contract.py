@@ -25,6 +25,8 @@ from vlagents_ray.naming import explain_unknown_fields
 _MAX_STATE_PARTS = 12
 _SHOWN_COMBINATIONS = 3  # largest number of combinations that a message lists
 
+# Fields of an action that only few contracts declare.
+_OMITTED_IF_NONE = ("absolute", "rotation_columns", "names")
 Rotation = Literal["none", "axis_angle", "euler_xyz", "quat_xyzw", "quat_wxyz", "rot6d"]
 
 
@@ -65,8 +67,14 @@ class ActionSpec:
     # Names of several arms, in the order of their commands in a row; each command is followed by
     # the command of the arm's gripper.
     arms: tuple[str, ...] | None = None
-    # Names of the joints in the order of a row, with or without the grippers.
+    # Names of the joints in the order of a row, with or without the grippers. If each number has a
+    # name, "gripper" in a name declares a gripper, and "velocity" or the ending ".vel" a velocity.
     names: tuple[str, ...] | None = None
+    # Columns, from 0, that are targets although `delta` is True, such as a waist beside an arm. The
+    # grippers, which are always targets, need not be among them.
+    absolute: tuple[int, ...] | None = None
+    # First column of each rotation; None: the column after the position, x, y, z, of each arm.
+    rotation_columns: tuple[int, ...] | None = None
 
     @property
     def relative(self) -> bool | None:
@@ -145,8 +153,9 @@ class Contract:
         values = asdict(self)
         if self.behaviour is None:
             del values["behaviour"]  # only policies for learners have this field
-        if self.action.names is None:
-            del values["action"]["names"]
+        for name in _OMITTED_IF_NONE:
+            if values["action"][name] is None:
+                del values["action"][name]
 
         plain: dict[str, Any] = json.loads(json.dumps(values, default=np.generic.item))
         return plain
@@ -170,6 +179,8 @@ class Contract:
             action = closed(ActionSpec, values["action"], "contract.action")
             action["arms"] = _names(action.get("arms"), "contract.action.arms")
             action["names"] = _names(action.get("names"), "contract.action.names")
+            for name in ("absolute", "rotation_columns"):
+                action[name] = _indices(action.get(name), f"contract.action.{name}")
             values["action"] = ActionSpec(**action)
         return cls(**values)
 
@@ -196,6 +207,15 @@ def _names(value: object, where: str) -> tuple[str, ...] | None:
         return tuple(value)
     if value is not None:
         raise MalformedMessage(f"{where}: expected a list of names, got {value!r}")
+    return None
+
+
+def _indices(value: object, where: str) -> tuple[int, ...] | None:
+    """Read a list of columns; None stays None."""
+    if isinstance(value, (list, tuple)) and all(type(index) is int for index in value):
+        return tuple(value)
+    if value is not None:
+        raise MalformedMessage(f"{where}: expected a list of whole numbers, got {value!r}")
     return None
 
 
@@ -369,7 +389,9 @@ _ACTION_CURES = {
     "dim": "choose the control mode the policy was trained with",
     "space": "choose the control mode the policy was trained with",
     "delta": "choose the matching delta or absolute control mode",
+    "absolute": "choose the control mode with the same absolute numbers",
     "rotation": "convert the rotation, or choose another control mode",
+    "rotation_columns": "put the rotations into the env's order",
     "frame": "choose the control mode of that frame",
     "gripper_open": "map the gripper's command",
     "gripper_closed": "map the gripper's command",
