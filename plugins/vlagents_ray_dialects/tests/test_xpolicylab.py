@@ -328,14 +328,17 @@ def test_a_repeated_act_is_answered_as_the_first_time(served: Served, messages: 
 
 
 def test_a_message_that_is_repeated_while_it_is_answered_waits_for_that_answer(
-    messages: Messages, tmp_path: Any
+    messages: Messages, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     agent, gate = BatchedMirror(), tmp_path / "gate"
     observation = xpolicylab_observation(255, f"{gate} task 1")
     message = xpolicylab("infer", "lost", observation=observation)
+    has_left = threading.Event()
+    monkeypatch.setattr("vlagents_ray_dialects.xpolicylab.current_client", lambda: has_left.is_set)
     with serving(agent, SETTINGS) as (client, _), client.websocket_connect("/xpolicylab") as a:
         a.send_bytes(message)
         wait_for(lambda: agent.sizes == [1])
+        has_left.set()
         answers: list[bytes] = []
 
         def repeat() -> None:
@@ -351,6 +354,71 @@ def test_a_message_that_is_repeated_while_it_is_answered_waits_for_that_answer(
     actions = [codec.decode(answer, Budget(LIMITS)).payload["actions"] for answer in answers]
     assert first_row(actions[0]) == first_row(actions[1])
     assert agent.sizes == [1]
+
+
+@pytest.mark.parametrize("pixels", [(10, 20), (10, 10)], ids=["other pixels", "equal pixels"])
+@pytest.mark.parametrize("called", [False, True], ids=["infer", "call"])
+def test_two_clients_with_equal_names_get_their_own_actions(
+    served: Served, messages: Messages, pixels: tuple[int, int], called: bool
+) -> None:
+    client, _, sizes = served
+
+    def act(socket: Any, pixel: int, message_id: str) -> list[float]:
+        if not called:
+            return first_row(messages.infer(socket, pixel, message_id))
+        messages.call(socket, "update_obs", xpolicylab_observation(pixel), f"u-{message_id}")
+        return first_row(messages.call(socket, "get_action", message_id=message_id))
+
+    with (
+        client.websocket_connect("/xpolicylab") as red,
+        client.websocket_connect("/xpolicylab") as blue,
+    ):
+        for step in range(3):
+            for socket, pixel in ((red, pixels[0]), (blue, pixels[1])):
+                assert act(socket, pixel + step, str(step)) == [pixel + step, 3, step + 1, 1]
+        assert sizes == [1] * 6
+        assert act(blue, pixels[1] + 2, "2")[0] == pixels[1] + 2
+    assert sizes == [1] * 6, "a repeated message was executed"
+
+
+def test_an_answer_is_of_one_trial_and_one_step(served: Served, messages: Messages) -> None:
+    client, _, sizes = served
+    labels = {
+        "evaluation_id": "e",
+        "action_case_id": "c",
+        "trial_id": "t",
+        "repeat_index": 0,
+        "step": 0,
+    }
+    with client.websocket_connect("/xpolicylab") as socket:
+        others: list[dict[str, Any]] = [{}]
+        for name, value in labels.items():
+            others.append({name: 5 if isinstance(value, int) else "other"})
+        for pixel, other in enumerate(others):
+            payload = {"observation": xpolicylab_observation(pixel)}
+            frame = codec.Frame("infer", "1", {**labels, **other}, payload)
+            socket.send_bytes(codec.encode(frame))
+            answer = codec.decode(socket.receive_bytes(), Budget(LIMITS))
+            assert first_row(answer.payload["actions"])[0] == pixel, other
+    assert sizes == [1] * 6
+
+
+def test_an_id_that_is_used_for_two_messages_is_an_error(
+    served: Served, messages: Messages
+) -> None:
+    client, _, sizes = served
+    with client.websocket_connect("/xpolicylab") as socket:
+        messages.infer(socket, 7, "1")
+        other = messages.ask(socket, "infer", "1", observation=xpolicylab_observation(8))
+        assert error_of(other) == ("invalid_frame", "malformed")
+        assert "message_id: expected a new id" in other.payload["message"]
+        assert sizes == [1]
+        # A reset begins the evaluation again, whose messages may have the same numbers.
+        messages.ask(socket, "reset")
+        assert first_row(messages.infer(socket, 8, "1"))[0] == 8
+        messages.ask(socket, "reset")
+        assert first_row(messages.infer(socket, 8, "1"))[0] == 8
+    assert sizes == [1, 1, 1]
 
 
 def test_a_message_that_failed_is_executed_when_it_is_repeated(

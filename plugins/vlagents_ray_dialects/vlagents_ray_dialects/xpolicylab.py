@@ -8,6 +8,8 @@ observation is decoded, and only `get_action` calls the policy.
 
 A client that has lost its connection connects again, and repeats its last message with the same
 `message_id`. An answered request for actions is not executed again: its answer is kept for a while.
+Clients may number their messages, so an answer is only repeated for the same content in the same
+step of the same trial, and never while the client that got it first is still connected.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ from vlagents_ray.protocol.messages import PriorityName, Reply
 from vlagents_ray.serve.access.api_keys import Identity, current_caller
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects import base
+from vlagents_ray.serve.endpoints.client_socket import current_client
 from vlagents_ray.serve.endpoints.http_messages import public_problem
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import Sender
@@ -50,7 +53,8 @@ from vlagents_ray_dialects.messages.xpolicylab import NO_FRAME, PRESETS, Frame
 _KEPT_ANSWERS, _KEPT_BYTES = 256, 16 * 2**20
 # The keys in the metadata of replicas that identify the policy of a deployment.
 _IDENTITY = ("cluster", "policy", "checkpoint", "config", "program", "version")
-_MessageKey = tuple[Identity, str]  # the sender of a message, and the message's id
+# The caller, the ids of evaluation, case and trial with their numbers, and the id of a message.
+_MessageKey = tuple[Identity, tuple[Any, ...], str]
 _METHODS = ("update_obs", "get_action", "update_obs_batch", "get_action_batch")
 
 
@@ -106,49 +110,146 @@ class XPolicyLabDialect(base.RouteDialect):
         return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
+@dataclass(eq=False, slots=True)
+class _KeptAnswer:
+    """The answer to a message of one connection.
+
+    Attributes:
+        connection: The connection on which the message arrived.
+        digest: The digest of the message's content without an observation.
+        observed: The digest of the observations of the act.
+        over: Completed when the message is answered or has failed.
+        data: The answer; None until the message is answered.
+    """
+
+    connection: _Connection
+    digest: bytes
+    observed: bytes
+    over: asyncio.Future[None]
+    data: bytes | None = None
+
+    def answers(self, connection: _Connection, digest: bytes, observed: bytes) -> bool:
+        """Return whether this is the answer to a message of a connection with such content.
+
+        A client that has connected again may have no observation: it repeats only its last message.
+        """
+        if digest != self.digest or (observed and observed != self.observed):
+            return False
+        return self.connection is connection or self.connection.has_ended
+
+
 class _AnswersOfActs:
     """The newest answers to requests for actions, for clients that repeat a message after a lost
     connection.
 
-    The sender of a message can only read the answers to its own messages.
+    The names in a message are chosen by its client, and two clients may choose equal names. A
+    client therefore gets only the answers of its own connection, or of a connection of the same
+    caller that has ended, and only to a message with the same content.
     """
 
     def __init__(self) -> None:
-        self._answers: OrderedDict[_MessageKey, bytes] = OrderedDict()
+        # The newest answer is the last.
+        self._answers: OrderedDict[tuple[_MessageKey, _Connection], _KeptAnswer] = OrderedDict()
+        # The connections that have used a name.
+        self._connections: dict[_MessageKey, dict[_Connection, None]] = {}
         self._bytes = 0
-        self._in_flight: dict[_MessageKey, asyncio.Future[None]] = {}
 
-    async def answer_once(self, message_id: str, act: Callable[[], Awaitable[bytes]]) -> bytes:
+    async def answer_once(
+        self,
+        connection: _Connection,
+        frame: Frame,
+        observed: bytes,
+        act: Callable[[], Awaitable[bytes]],
+    ) -> bytes:
         """Return the answer to a message: the answer of `act`, or the kept answer if the message
         was answered before.
 
         A message that is repeated while it is being answered waits for that answer. If the first
         message was not answered, as its client had disconnected before the act began, the act is
         executed now.
+
+        Args:
+            connection: The connection on which the message arrived.
+            frame: The message.
+            observed: The digest of the observations on which it acts; empty if there are none.
+            act: Executes the message.
+
+        Raises:
+            MalformedMessage: The connection has used the id for another message.
         """
-        key = (current_caller(), message_id)
-        while key in self._in_flight:
-            await asyncio.shield(self._in_flight[key])
-        if key in self._answers:
-            return self._answers[key]
+        key = (current_caller(), tuple(frame.labels.values()), frame.message_id)
+        other = {name: value for name, value in frame.payload.items() if name != "observation"}
+        digest = xpolicylab.digest(other)
+        kept = self._find(key, connection, digest, observed)
+        while kept is not None:
+            await asyncio.shield(kept.over)
+            if kept.data is not None:
+                return kept.data
+            kept = self._find(key, connection, digest, observed)
 
         over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._in_flight[key] = over
+        answer = _KeptAnswer(connection, digest, observed, over)
+        self._answers[key, connection] = answer
+        self._connections.setdefault(key, {})[connection] = None
         try:
-            answer = await act()
+            answer.data = await act()
+        except BaseException:
+            self._forget(key, connection)
+            raise
         finally:
-            del self._in_flight[key]
             over.set_result(None)
-        self._keep(key, answer)
-        return answer
 
-    def _keep(self, key: _MessageKey, answer: bytes) -> None:
-        """Keep an answer, and drop the oldest answers if there are too many."""
-        self._answers[key] = answer
-        self._bytes += len(answer)
-        while len(self._answers) > _KEPT_ANSWERS or self._bytes > _KEPT_BYTES:
-            _, oldest = self._answers.popitem(last=False)
-            self._bytes -= len(oldest)
+        if self._answers.get((key, connection)) is answer:  # not forgotten by a reset meanwhile
+            self._bytes += len(answer.data)
+            self._answers.move_to_end((key, connection))
+            self._forget_oldest()
+        return answer.data
+
+    def forget_evaluation(self, connection: _Connection, evaluation: str) -> None:
+        """Forget the answers of an evaluation that a client begins again, except those of other
+        connected clients.
+        """
+        caller = current_caller()
+        for key, sender in list(self._answers):
+            is_of_client = sender is connection or sender.has_ended
+            if is_of_client and key[0] == caller and key[1][0] == evaluation:
+                self._forget(key, sender)
+
+    def _find(
+        self, key: _MessageKey, connection: _Connection, digest: bytes, observed: bytes
+    ) -> _KeptAnswer | None:
+        """Return the answer to a repeated message; None if the message is new."""
+        own = self._answers.get((key, connection))
+        if own is not None:
+            if own.answers(connection, digest, observed):
+                return own
+            raise MalformedMessage(
+                f"message_id: expected a new id for each message of a step, got {key[2]!r} for two "
+                "different messages; count up, or draw random ids"
+            )
+        for sender in self._connections.get(key, ()):
+            kept = self._answers[key, sender]
+            if kept.answers(connection, digest, observed):
+                return kept
+        return None
+
+    def _forget_oldest(self) -> None:
+        """Forget the oldest answers if there are too many."""
+        for (key, sender), answer in list(self._answers.items()):
+            if len(self._answers) <= _KEPT_ANSWERS and self._bytes <= _KEPT_BYTES:
+                return
+            if answer.data is not None:
+                self._forget(key, sender)
+
+    def _forget(self, key: _MessageKey, connection: _Connection) -> None:
+        """Forget an answer, if it is still kept."""
+        answer = self._answers.pop((key, connection), None)
+        if answer is None:
+            return
+        self._bytes -= len(answer.data or b"")
+        del self._connections[key][connection]
+        if not self._connections[key]:
+            del self._connections[key]
 
 
 class _UpdateMessage:
@@ -206,9 +307,17 @@ class _Connection:
         self._sender: Sender = dialect.sender()
         self._environments: dict[int, _Environment] = {}
         self._updated: list[int] = []  # the environments of the last update
+        self._has_left = current_client()
+        self._is_closed = False
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the client has closed the connection."""
+        return self._is_closed or (self._has_left is not None and self._has_left())
 
     def close(self) -> None:
         """End the sessions."""
+        self._is_closed = True
         self._drop_observations()
         self._sender.release(for_good=True)
 
@@ -273,6 +382,7 @@ class _Connection:
             payload["server_instance_id"] = self._dialect.server_instance_id()
         elif frame.kind == "reset":
             self._begin_episodes()
+            self._dialect.answers.forget_evaluation(self, frame.labels["evaluation_id"])
         elif frame.kind == "infer":
             return await self._infer(frame, message, admission, request_id)
         elif frame.kind == "call":
@@ -383,7 +493,8 @@ class _Connection:
     ) -> bytes:
         """Answer with the chunks of environments; a repeated message gets its first answer."""
         act = partial(self._act_together, indices, frame, message, request_id)
-        answer = await self._dialect.answers.answer_once(frame.message_id, act)
+        answers = self._dialect.answers
+        answer = await answers.answer_once(self, frame, self._observed(indices), act)
         for index in indices:
             environment = self._environments.get(index)
             if environment is not None:
@@ -410,6 +521,17 @@ class _Connection:
 
         replies = await base.act_together(message, session_inputs, request_id)
         return dialect.encoded(message, partial(self._chunks, frame, replies))
+
+    def _observed(self, indices: list[int]) -> bytes:
+        """Return the digest of the observations of environments that wait for an act; empty if
+        there are none.
+        """
+        contents = {}
+        for index in indices:
+            environment = self._environments.get(index)
+            if environment is not None and environment.observation is not None:
+                contents[str(index)] = environment.observation.content
+        return xpolicylab.digest(contents) if contents else b""
 
     def _waiting(self, indices: list[int]) -> list[tuple[base.ImplicitSession, _Observation]]:
         """Return the sessions of environments, with the observations that wait for an act.

@@ -9,7 +9,8 @@ data format v1.0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Any
@@ -162,6 +163,13 @@ def error_answer(frame: Frame, error: VLAgentsError, request_id: str) -> bytes:
     return encode(replace(frame, kind=ERROR, payload=payload))
 
 
+def digest(value: Any) -> bytes:
+    """Return the SHA-256 of a value in a message, whose arrays may be views of the message."""
+    hasher = hashlib.sha256()
+    _hash(value, hasher.update)
+    return hasher.digest()
+
+
 def batch_of(value: Any, most: int) -> list[dict[str, Any]]:
     """Return the observations of a batch.
 
@@ -289,6 +297,26 @@ def _error_code(frame: Frame, error: VLAgentsError) -> str:
     if isinstance(error, MalformedMessage | MessageTooLarge):
         return "invalid_frame"
     return _FAILED.get(frame.kind, "internal")
+
+
+def _hash(value: Any, update: Callable[[bytes | memoryview], None]) -> None:
+    """Hash a value with its type, so that no two values are written alike."""
+    if isinstance(value, dict):
+        update(b"map %d " % len(value))
+        for key, item in value.items():
+            _hash(key, update)
+            _hash(item, update)
+    elif isinstance(value, list):
+        update(b"list %d " % len(value))
+        for item in value:
+            _hash(item, update)
+    elif isinstance(value, np.ndarray):
+        update(f"array {value.dtype.str} {value.shape} ".encode())
+        update(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
+    else:
+        data = value if isinstance(value, bytes) else repr(value).encode(errors="replace")
+        update(f"{type(value).__name__} {len(data)} ".encode())
+        update(data)
 
 
 def _node(node: dict[Any, Any]) -> Any:
