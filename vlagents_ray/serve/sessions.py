@@ -236,10 +236,7 @@ class SessionTable(Generic[M]):
         with self._lock:
             session = self._sessions.get(session_id)
             if session is None:
-                self.require_allowed(origin)
-                if len(self._sessions) >= self.limit:
-                    self.drop_idle()
-                self.require_room(session_id)
+                self.require_room([session_id], origin)
                 session = self._sessions[session_id] = Session(session_id)
                 self.opened += 1
         session.used = time.monotonic()
@@ -317,12 +314,21 @@ class SessionTable(Generic[M]):
                 session is not None and session.steps > first
             )
 
-    def require_room(self, session_id: str) -> None:
-        """Raise `PolicyUnavailable` if the session is new and the replica has reached its limit of
-        sessions.
+    def require_room(self, session_ids: Sequence[str], origin: Origin = NOWHERE) -> None:
+        """Raise an error unless there is room for all of these sessions, of which some may exist.
+
+        Raises:
+            PolicyUnavailable: The replica would exceed its limit of sessions.
+            TooManyRequests: The key of the origin's caller would exceed its limit of sessions.
         """
         with self._lock:
-            if session_id not in self._sessions and len(self._sessions) >= self.limit:
+            new = sum(session_id not in self._sessions for session_id in session_ids)
+            if not new:
+                return
+            self.require_allowed(origin, new)
+            if len(self._sessions) + new > self.limit:
+                self.drop_idle()
+            if len(self._sessions) + new > self.limit:
                 raise self.full()
 
     def full(self) -> PolicyUnavailable:
@@ -418,17 +424,17 @@ class SessionTable(Generic[M]):
                     self._forget(session_id)
                 self._remember(session_id, (step - 1, _ANY))
 
-    def require_allowed(self, origin: Origin) -> None:
-        """Raise `TooManyRequests` if the key of the origin's caller has reached its limit of
+    def require_allowed(self, origin: Origin, new: int = 1) -> None:
+        """Raise `TooManyRequests` if the key of the origin's caller may not have this number of new
         sessions.
         """
         if origin.caller is None or origin.caller.sessions is None:
             return
         limit = origin.caller.sessions
         with self._lock:
-            if self._number_of(origin.prefix) >= limit:
+            if self._number_of(origin.prefix) + new > limit:
                 self.drop_idle()
-            if self._number_of(origin.prefix) < limit:
+            if self._number_of(origin.prefix) + new <= limit:
                 return
         raise TooManyRequests(
             f"key {origin.prefix.rstrip('/')!r} holds {limit} sessions here, as many as it allows; "
@@ -467,8 +473,19 @@ class SessionTable(Generic[M]):
             for session_id in session_ids:
                 session = self._sessions.get(session_id)
                 if session is not None and session.origin.owner == connection:
-                    # Setting this makes a waiting reset void.
-                    self._forget(session_id, (max(session.steps, session.expected), _ANY))
+                    self._discard(session)
+
+    def discard(self, session_ids: Iterable[str]) -> None:
+        """Close sessions that a message has begun in vain."""
+        with self._lock:
+            for session_id in session_ids:
+                session = self._sessions.get(session_id)
+                if session is not None:
+                    self._discard(session)
+
+    def _discard(self, session: Session[M]) -> None:
+        # This version makes a waiting reset void.
+        self._forget(session.id, (max(session.steps, session.expected), _ANY))
 
     def close_all(self) -> None:
         """Close all sessions, and drop their agents, since the model of these agents is closed.

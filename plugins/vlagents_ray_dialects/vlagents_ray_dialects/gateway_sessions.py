@@ -101,7 +101,8 @@ class GatewaySessions:
     def act_batch(
         self, charge: Charge, obs: Sequence[Obs], instructions: Sequence[str | None]
     ) -> list[Act]:
-        """Reset the sessions with a new instruction, and return the next action of each session.
+        """Reset the sessions with a new instruction, and return the next action of each session, as
+        `vlagents_ray.serve.dialects.base.act_together` does: of all, or of none.
 
         Args:
             charge: The charge of the client's message; `account` created it when the message
@@ -116,6 +117,7 @@ class GatewaySessions:
             TooManyRequests: The client's key is over its rate; nothing was acted on.
             VLAgentsError: The first error of a session.
         """
+        held = len(self._agents)
         agents = self._sessions(len(obs))
         charge.cover(len(obs))
 
@@ -136,13 +138,25 @@ class GatewaySessions:
                 [texts[i] for i in beginning],
                 [agents[i] for i in beginning],
             )
-            raise_first(infos)
+            self._require_all(infos, held)
 
         acts = agents[0].act_batch(obs, agents)
-        for episode, text in zip(self._episodes, texts, strict=True):
-            episode.began(text)
-        raise_first(acts)
+        failed = [act for act in acts if isinstance(act, Exception)]
+        # If the policy has acted on some of the observations, all episodes begin again.
+        if not failed or len(failed) == len(acts):
+            for i, episode in enumerate(self._episodes):
+                if not failed or i not in beginning:
+                    episode.began(texts[i])
+        self._require_all(acts, held)
         return [act for act in acts if isinstance(act, Act)]
+
+    def _require_all(self, results: Sequence[object], held: int) -> None:
+        """Raise the first error among the results of the client's sessions, after ending all but
+        the first `held` sessions.
+        """
+        if any(isinstance(result, Exception) for result in results):
+            self._end_after(held)
+        raise_first(results)
 
     def show(self, caller: Identity, key: str | None) -> None:
         """Set the client; end the sessions of another client, or of another priority.
@@ -187,18 +201,21 @@ class GatewaySessions:
         self._hold(max(number, self._counted_sessions))
         if not self._agents:
             self._agents = [self._connect(self._key, self._priority)]
-        for agent in self._agents[number:]:
-            agent.close()
-        del self._agents[number:]
-        self._hold(number)
+        self._end_after(number)
 
         missing = number - len(self._agents)
         if missing:
             self._agents += self._agents[0].sessions(missing)
-        del self._episodes[number:]
         while len(self._episodes) < number:
             self._episodes.append(ImplicitEpisode())
         return self._agents
+
+    def _end_after(self, number: int) -> None:
+        """End all but the first `number` sessions."""
+        for agent in self._agents[number:]:
+            agent.close()
+        del self._agents[number:], self._episodes[number:]
+        self._hold(min(number, self._counted_sessions))
 
     def _hold(self, number: int) -> None:
         """Set the number of sessions that count for the key; raise `TooManyRequests` beyond its

@@ -396,8 +396,12 @@ class GR00TConnection(GatewayClient):
 
         spec = None if contract is None else contract.action
         info = {"done": [act.done for act in acts], "timing": acts[0].info.get("timing", {})}
-        actions = [mapping.actions(act.action, spec) for act in acts]
-        return gr00t.write_actions(actions, batch, info)
+        try:
+            actions = [mapping.actions(act.action, spec) for act in acts]
+            return gr00t.write_actions(actions, batch, info)
+        except VLAgentsError:
+            self.sessions.restart()  # a repeated message must not be a second act
+            raise
 
     def _modalities(self) -> dict[str, tuple[list[str], list[int]]]:
         """Return the keys and the time steps of each modality, with the client's names."""

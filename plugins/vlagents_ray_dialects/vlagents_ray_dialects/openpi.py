@@ -305,7 +305,7 @@ class MapConnection:
             session_inputs.append(base.SessionObs(session, obs, instruction))
 
         incoming.decoded_alike(len(observations))
-        replies = await base.act_together(incoming, session_inputs, request_id)
+        replies = await base.act_together(incoming, session_inputs, request_id, dialect.rows)
 
         before_ms, batched = self._before_ms, batch is not None
 

@@ -5,6 +5,7 @@ An error over HTTP has its status and a JSON document, whose `detail` SGLang's c
 
 from __future__ import annotations
 
+import asyncio
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -136,19 +137,26 @@ class SGLangDialect(base.HttpDialect):
         for session, (obs, instruction), begins in zip(
             sessions, inputs, request.begins_episode, strict=True
         ):
-            if begins:
-                session.episode.end()
-            session_inputs.append(base.SessionObs(session, obs, instruction))
+            session_inputs.append(base.SessionObs(session, obs, instruction, begins))
         if not sessions[0].episode.begun:
             self.mapping.warn_of_unread_cameras(request.observations[0], self.name)
-        return await base.act_together(message, session_inputs, name)
+
+        def read(reply: Reply) -> None:
+            """Raise an error if the client cannot be sent the action of a reply."""
+            sglang.trimmed(self.rows(reply), request)
+
+        return await base.act_together(message, session_inputs, name, read)
 
     async def _sessions(
         self, request: GenerationRequest, sender: Sender, own: base.ImplicitSession | None
     ) -> list[base.ImplicitSession]:
         """Return the session of each observation of a request."""
         if request.session_names:
-            return [await self.client_session(sender, name) for name in request.session_names]
+            # All names are searched for at once: each search takes a tenth of a second.
+            searches = []
+            for name, begins in zip(request.session_names, request.begins_episode, strict=True):
+                searches.append(self.client_session(sender, name, begins=begins))
+            return await asyncio.gather(*searches)
         if own is not None and not request.is_batch:
             return [own]
         return [self.session(sender, uuid.uuid4().hex) for _ in request.observations]

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 from starlette.websockets import WebSocket
 
 from vlagents_ray.errors import (
@@ -519,7 +520,7 @@ class _Connection:
             session_inputs.append(base.SessionObs(session, obs, instruction))
         message.decoded_alike(len(session_inputs))
 
-        replies = await base.act_together(message, session_inputs, request_id)
+        replies = await base.act_together(message, session_inputs, request_id, self._columns)
         return dialect.encoded(message, partial(self._chunks, frame, replies))
 
     def _observed(self, indices: list[int]) -> bytes:
@@ -558,13 +559,14 @@ class _Connection:
             )
         return waiting
 
+    def _columns(self, reply: Reply) -> Mapping[str, np.ndarray]:
+        """Return the columns of the action in a reply by the client's names."""
+        rows = self._dialect.rows(reply)
+        return self._dialect.mapping.columns(rows) or {"actions": rows}
+
     def _chunks(self, frame: Frame, replies: Sequence[Reply]) -> bytes:
         """Return the answer with the chunk of each environment."""
-        chunks = []
-        for reply in replies:
-            rows = self._dialect.rows(reply)
-            columns = self._dialect.mapping.columns(rows) or {"actions": rows}
-            chunks.append(xpolicylab.action_maps(columns))
+        chunks = [xpolicylab.action_maps(self._columns(reply)) for reply in replies]
 
         latency_ms = 0.0
         for reply in replies:

@@ -493,6 +493,11 @@ class ImplicitSession:
         request = self._request("close", None, None, "")
         await self._sender.ask(self._sender.message(charge, "close"), Decoded([request], {}))
 
+    @property
+    def id(self) -> str:
+        """The session's id in the engine."""
+        return self._sender.id_of(self._name) if self._name else self._sender.session_id
+
     def _request(
         self, op: Op, obs: Obs | None, instruction: str | None, request_id: str
     ) -> Request:
@@ -502,24 +507,43 @@ class ImplicitSession:
 
 
 class SessionObs(NamedTuple):
-    """An observation of a session, and its instruction, which is None if there is none."""
+    """An observation of a session, and its instruction, which is None if there is none.
+
+    `begins` is whether the client begins an episode with it; otherwise the session's
+    `ImplicitEpisode` decides.
+    """
 
     session: ImplicitSession
     obs: Obs
     instruction: str | None
+    begins: bool = False
 
 
 async def act_together(
-    message: IncomingMessage, observations: Sequence[SessionObs], request_id: str
+    message: IncomingMessage,
+    observations: Sequence[SessionObs],
+    request_id: str,
+    read: Callable[[Reply], object] | None = None,
 ) -> list[Reply]:
-    """Return the policy's reply to each observation in a client's message; their acts are queued
-    together.
+    """Return the policy's reply to each observation in a client's message, whose acts are queued
+    together: all of them, or none.
 
     A session whose episode begins is reset first. A session that was removed because it was idle is
     reset again. That is safe, since the policy has not received the observation.
 
+    If an observation is rejected, the sessions that the message has begun end. If the policy has
+    acted on some of several observations, the episodes of all of them end, so that a repeated
+    message begins them again, and no session is a step ahead of its client.
+
+    Args:
+        message: The client's message.
+        observations: The observations, each of another session.
+        request_id: The id of the message, for the log.
+        read: Raises an error if the client cannot be sent the action of a reply.
+
     Raises:
         TooManyRequests: The client's key is over its rate; the policy has received nothing.
+        PolicyUnavailable: There is no room for all new sessions; the policy has received nothing.
         VLAgentsError: The first error among the replies.
     """
     charge = message.charge
@@ -530,12 +554,43 @@ async def act_together(
         )
     charge.cover(len(observations))
 
+    engine = observations[0].session._engine
+    new_ids = [session.id for session, *_ in observations if session.id not in engine.sessions]
     beginning = [
         session_obs
         for session_obs in observations
-        if session_obs.session.episode.begins(session_obs.instruction)
+        if session_obs.begins or session_obs.session.episode.begins(session_obs.instruction)
     ]
-    await _reset(beginning, charge, request_id)
+    ending: Sequence[SessionObs] = beginning  # their episodes end if there is an error
+    try:
+        observations[0].session._sender.require_room(new_ids)
+        if len(observations) > 1:
+            model = engine.model.require_loaded()
+            for session, obs, instruction, _ in observations:
+                model.check(session._request("act", obs, instruction, request_id))
+        await _reset(beginning, charge, request_id)
+
+        # Until all replies are known, the policy may have acted on any of the observations.
+        ending = beginning if len(observations) == 1 else observations
+        replies = await _act(message, observations, charge, request_id)
+        if all(reply.error is not None for reply in replies):
+            ending = beginning
+        raise_first(reply.error for reply in replies)
+        if read is not None:
+            for reply in replies:
+                read(reply)
+    except BaseException:
+        for session_obs in ending:
+            session_obs.session.episode.end()
+        engine.sessions.discard(new_ids)
+        raise
+    return replies
+
+
+async def _act(
+    message: IncomingMessage, observations: Sequence[SessionObs], charge: Charge, request_id: str
+) -> list[Reply]:
+    """Return the reply to each observation; sessions that were forgotten are reset again."""
     replies = await _ask(message, "act", observations, [None] * len(observations), request_id)
 
     forgotten = [
@@ -553,8 +608,6 @@ async def act_together(
         repeated = await _ask(acts, "act", again, [None] * len(again), request_id)
         for index, reply in zip(forgotten, repeated, strict=True):
             replies[index] = reply
-
-    raise_first(reply.error for reply in replies)
     return replies
 
 
@@ -566,9 +619,9 @@ async def _reset(observations: Sequence[SessionObs], charge: Charge, request_id:
         return
 
     openings = []
-    for session, _, instruction in observations:
+    for session, _, instruction, _ in observations:
         openings.append(session.episode.opening(instruction, session._engine.contract))
-    for session, _, _ in observations:
+    for session, *_ in observations:
         session.episode.end()
 
     first = observations[0].session
@@ -578,7 +631,7 @@ async def _reset(observations: Sequence[SessionObs], charge: Charge, request_id:
     answers.timed(resets, lambda: None)
     first._engine.stats.record(resets)
 
-    for (session, _, _), opening, reply in zip(observations, openings, replies, strict=True):
+    for (session, *_), opening, reply in zip(observations, openings, replies, strict=True):
         if reply.error is None:
             session.episode.began(opening)
     raise_first(reply.error for reply in replies)
@@ -596,7 +649,7 @@ async def _ask(
     """
     requests = []
     pairs = zip(observations, instructions, strict=True)
-    for index, ((session, obs, _), instruction) in enumerate(pairs):
+    for index, ((session, obs, *_), instruction) in enumerate(pairs):
         name = request_id if len(observations) == 1 else f"{request_id}-{index}"
         requests.append(session._request(op, obs, instruction, name))
     return await observations[0].session._sender.ask(message, Decoded(requests, {}))
@@ -709,7 +762,9 @@ class HttpDialect(RouteDialect):
         session.episode.end()
         return Response(b"{}", media_type="application/json")
 
-    async def client_session(self, sender: Sender, name: str) -> ImplicitSession:
+    async def client_session(
+        self, sender: Sender, name: str, *, begins: bool = False
+    ) -> ImplicitSession:
         """Return the session that a client calls `name`, for its current request; the session's
         episode exists as long as the session exists in an engine.
 
@@ -717,6 +772,8 @@ class HttpDialect(RouteDialect):
             sender: The sender of that request, which may use another connection than earlier
                 requests.
             name: The client's name of the session.
+            begins: Whether the request begins an episode, so that no other replica is searched for
+                the session.
         """
         sessions = self.context.engine.sessions
         if len(self._episodes) > 2 * len(sessions) + 16:
@@ -731,7 +788,7 @@ class HttpDialect(RouteDialect):
         if key not in self._episodes or engine_id not in sessions:
             finder = self.context.engine.finder
             # If this replica does not have the session, another replica may have served it.
-            if finder is not None and engine_id not in sessions:
+            if finder is not None and engine_id not in sessions and not begins:
                 over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
                 if finder.fetch(engine_id, partial(settle, over, None), caller_name()):
                     await over

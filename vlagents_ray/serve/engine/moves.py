@@ -77,7 +77,7 @@ class SessionMoves:
         version of the weights, if this replica does not hold that version.
         """
         self._health.require_ready()
-        self._sessions.require_room(session_id)
+        self._sessions.require_room([session_id])
 
         first, moves = state.first, state.moves + 1
         arriving: Session[LoadedModel] = Session(

@@ -104,6 +104,12 @@ class Sender:
         """Return the id in the engine of the session that the sender calls `session_name`."""
         return self._prefix + session_name
 
+    def require_room(self, session_ids: Sequence[str]) -> None:
+        """Raise the errors of `SessionTable.require_room` unless there is room for all of these
+        sessions of the sender, by their ids in the engine.
+        """
+        self._engine.sessions.require_room(session_ids, self._origin)
+
     def message(
         self, charge: Charge, op: str = "unknown", priority: str = "robot"
     ) -> IncomingMessage:
