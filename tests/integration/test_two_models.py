@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 import threading
+import urllib.request
 from collections.abc import Iterator
 
 import pytest
@@ -30,6 +31,11 @@ def server(shared_ray: None) -> Iterator[Server]:
 def test_the_program_does_its_task_with_both_models(
     server: Server, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    with urllib.request.urlopen(
+        f"{server.url}/healthz", timeout=30
+    ) as answer:  # of all applications
+        assert answer.status == 200
+
     two_models.main(server.url)
     out = capsys.readouterr().out
     assert out.startswith("put the cup away: done\n")

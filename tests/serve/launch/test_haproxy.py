@@ -12,7 +12,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, HTTPServer, ThreadingHTTPServer
@@ -96,25 +96,21 @@ def test_it_is_late_while_a_replica_that_runs_is_not_reached(running: int, rows:
 
 
 @contextmanager
-def proxied(folder: Path, *servers: str, settings: str = "") -> Iterator[str]:
-    """Yield the URL of a HAProxy in front of an application with these servers; ADDRESS never
-    answers.
+def started(folder: Path, settings: str) -> Iterator[str]:
+    """Start HAProxy with these settings, in which PORT is its own port and ADDRESS accepts
+    connections but never answers, and yield its URL.
     """
     port = free_port()
     config = folder / "haproxy.cfg"
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"127.0.0.1:{silent.getsockname()[1]}"
-        text = (
+        common = (
             f"global\n    maxconn {MOST_CONNECTIONS}\n"
-            "defaults\n    mode http\n    timeout connect 60s\n    timeout client 60s\n    timeout "
-            "server 60s\n"
-            f"frontend http_frontend\n    bind 127.0.0.1:{port}\n"
-            "    acl routes path -i /-/routes\n"
-            '    http-request return status 200 content-type text/plain string "all applications" '
-            "if routes\n"
-            "    default_backend http-app\n"
-            "backend http-app\n" + settings + "".join(f"    server {one}\n" for one in servers)
+            "defaults\n    mode http\n"
+            "    timeout connect 60s\n    timeout client 60s\n    timeout server 60s\n"
+            "frontend http_frontend\n    bind 127.0.0.1:PORT\n"
         )
+        text = (common + settings).replace("PORT", str(port))
         config.write_text(text.replace("ADDRESS", address))
         open_port(folder)
         command = [str(_write_launcher(folder, str(haproxy_binary()))), "-db", "-f", str(config)]
@@ -124,6 +120,20 @@ def proxied(folder: Path, *servers: str, settings: str = "") -> Iterator[str]:
                 yield f"http://127.0.0.1:{port}"
             finally:
                 proxy.terminate()
+
+
+@contextmanager
+def proxied(folder: Path, *servers: str, settings: str = "") -> Iterator[str]:
+    """Yield the URL of a HAProxy in front of an application with these servers."""
+    frontend = (
+        "    acl routes path -i /-/routes\n"
+        '    http-request return status 200 content-type text/plain string "all applications" '
+        "if routes\n"
+        "    default_backend http-app\n"
+    )
+    lines = "".join(f"    server {one}\n" for one in servers)
+    with started(folder, f"{frontend}backend http-app\n{settings}{lines}") as url:
+        yield url
 
 
 def seconds(setting: str) -> float:
@@ -217,6 +227,51 @@ def test_without_a_replica_that_answers_haproxy_does(
         said = refused.value.read()
         assert refused.value.headers["retry-after"] == "1"
         assert isinstance(refusal(503, refused.value.headers["content-type"], said), NoReplica)
+
+
+@contextmanager
+def applications(folder: Path, servers: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield the URL of a HAProxy in front of applications, of which each has a path and servers,
+    as in Serve's settings.
+    """
+    frontend: list[str] = []
+    backends = ["backend default_backend", "    http-request return status 404"]
+    for path, lines in servers.items():
+        name = f"http-{path.strip('/') or 'root'}"
+        prefix = path if path == "/" else f"{path}/"
+        frontend += [f"    acl is_{name} path_beg {prefix}", f"    acl is_{name} path {path}"]
+        frontend += [f"    use_backend {name} if is_{name}"]
+        backends += [f"backend {name}", *(f"    server {line}" for line in lines)]
+
+    settings = [*frontend, "    default_backend default_backend", *backends, ""]
+    with started(folder, "\n".join(settings)) as url:
+        yield url
+
+
+OTHER = REPLICA.replace("Policy-1", "Policy-2")
+DISABLED = f"{REPLICA} disabled"
+
+
+@needs_haproxy
+@pytest.mark.parametrize(
+    ("servers", "status"),
+    [
+        ({"/left": [REPLICA, FALLBACK], "/right": [REPLICA, FALLBACK]}, 200),
+        ({"/left": [DISABLED, OTHER, FALLBACK], "/right": [REPLICA]}, 200),
+        ({"/left": [REPLICA, FALLBACK], "/right": [FALLBACK]}, 503),
+        ({"/left": [DISABLED, FALLBACK], "/right": [REPLICA, FALLBACK]}, 503),
+        ({"/left": [REPLICA, FALLBACK]}, 200),
+        ({}, 404),
+        # The application at "/" replies itself; here nothing answers for it.
+        ({"/": [FALLBACK], "/right": [REPLICA, FALLBACK]}, 503),
+    ],
+)
+def test_the_health_of_several_applications_is_at_the_root(
+    servers: Mapping[str, Sequence[str]], status: int, tmp_path: Path
+) -> None:
+    with applications(tmp_path, servers) as url:
+        answer = answer_to(url, "GET /healthz HTTP/1.1\r\nhost: a\r\n\r\n")
+        assert answer.startswith(f"HTTP/1.1 {status} ".encode())
 
 
 @needs_haproxy

@@ -51,6 +51,34 @@ _LIMIT_PER_ADDRESS = (
     "    tcp-request connection track-sc0 src",
     f"    tcp-request connection reject if {{ sc0_conn_cur gt {_CONNECTIONS_PER_ADDRESS} }}",
 )
+# A program for `awk`, which reads the settings file of Serve twice and adds rules for `/healthz` to
+# its frontend: 200 if each application has a replica that HAProxy reaches. An application at `/`
+# replies itself. Without these rules, the path is a 404 on a server with several applications.
+_HEALTH_RULES = r"""
+FNR == 1 { reading++ }
+reading == 1 && $1 == "acl" && $2 ~ /^is_/ && $3 == "path" && $NF == "/" { root = 1 }
+reading == 1 && $1 == "backend" { backend = $2 }
+reading == 1 && $1 == "backend" && $2 !~ /^default_backend$|-via-ingress-request-router$/ {
+    apps[++count] = $2
+}
+reading == 1 && $1 == "server" && $2 ~ /^SERVE_REPLICA/ {
+    replicas[backend] = replicas[backend] " " $2
+}
+reading == 2 { print }
+reading == 2 && /^frontend http_frontend$/ && count && !root {
+    health = "{ path /healthz }"
+    reply = "    http-request return content-type text/plain"
+    for (app = 1; app <= count; app++) {
+        acl = "    acl app_" app "_replica_up"
+        print acl " always_false"
+        names = split(replicas[apps[app]], name, " ")
+        for (i = 1; i <= names; i++) print acl " srv_is_up(" apps[app] "/" name[i] ")"
+        refusal = "string \"an application has no replica\""
+        print reply " status 503 " refusal " if " health " !app_" app "_replica_up"
+    }
+    print reply " status 200 string OK if " health
+}
+"""
 # HAProxy's settings on every Serve cluster to which robots connect. The files in cluster/ contain
 # the same settings, for clusters that are not started by this package.
 ROBOTS = {
@@ -261,6 +289,8 @@ def _write_launcher(
     systems retry a refused connection, but give up after a rejected handshake. `open_port` opens it
     immediately.
 
+    `GET /healthz` returns 200 if each application has a replica, see `_HEALTH_RULES`.
+
     If an application has no replica, Serve would hold its requests until a replica runs. With these
     settings, requests are held only briefly, so that an application scaled to zero starts a
     replica, and are then answered with 503. WebSockets wait.
@@ -312,12 +342,14 @@ def _write_launcher(
     )
 
     programs = " ".join(f"-e '{change}'" for change in changes)
+    health = shlex.quote(_HEALTH_RULES)
     script = folder / "haproxy"
     script.write_text(
         "#!/bin/sh\n"
         "for word; do\n"
         """    if [ "$before" = -f ]; then\n"""
         f"""        sed -i -E {programs} "$word"\n"""
+        f"""        awk {health} "$word" "$word" >"$word.new" && mv "$word.new" "$word"\n"""
         f"{opening if alone else ''}"
         "    fi\n"
         "    before=$word\n"
