@@ -17,10 +17,10 @@ from typing_extensions import Self
 from benchmarks.network import NetworkTimer
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.protocol.messages import PRIORITIES, PriorityName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 
 INSTRUCTION = "pick up the cube"

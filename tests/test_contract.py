@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,14 +20,20 @@ from vlagents_ray.contract import (
 from vlagents_ray.errors import (
     ContractMismatch,
     InvalidAction,
+    InvalidInput,
     InvalidObservation,
     MalformedMessage,
     MissingCamera,
     MissingState,
     NotOffered,
 )
-from vlagents_ray.interface import Act, Obs
-from vlagents_ray.validation import LARGEST_ACTION, check_action, check_observation
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.validation import (
+    LARGEST_ACTION,
+    check_action,
+    check_observation,
+    check_options,
+)
 
 POLICY = Contract(
     cameras={"front": CameraSpec(224, 224), "wrist": CameraSpec()},
@@ -84,16 +91,35 @@ def test_each_difference_is_named(env: Contract, word: str) -> None:
     assert word in found[0]
 
 
-def test_a_missing_camera_is_cured_in_the_env_or_in_the_policy() -> None:
-    [found] = differences(
-        replace(POLICY, cameras={"image": CameraSpec()}),
-        replace(ENV, cameras={"wrist": CameraSpec(), "front": CameraSpec()}),
-    )
-    assert found.endswith("or set the policy's `cameras`, such as {image: front}")
-    [found] = differences(
-        replace(POLICY, cameras={"image": CameraSpec()}), replace(ENV, cameras={})
-    )
-    assert found.endswith("add or rename a camera of the env")
+@pytest.mark.parametrize(
+    ("needed", "provided", "renamed"),
+    [
+        (
+            ["top", "wrist"],
+            ["images/top", "images/wrist"],
+            {"top": "images/top", "wrist": "images/wrist"},
+        ),
+        (["top"], ["images/Top"], {"top": "images/Top"}),
+        (["image"], ["wrist", "front"], {}),
+        (["wrist_left"], ["images/wrist_right"], {}),
+        (["rgb"], ["left/rgb", "right/rgb"], {}),
+        (["images/top", "top"], ["images/top"], {}),
+        (["top"], [], {}),
+    ],
+)
+def test_the_cure_of_a_missing_camera_proposes_only_the_camera_of_that_name(
+    needed: list[str], provided: list[str], renamed: dict[str, str]
+) -> None:
+    policy = replace(POLICY, cameras={name: CameraSpec() for name in needed})
+    env = replace(ENV, cameras={name: CameraSpec() for name in provided})
+    found = differences(policy, env)
+    missing = [name for name in needed if name not in provided]
+    assert len(found) == len(missing)
+    for name, sentence in zip(missing, found, strict=True):
+        assert sentence.startswith(f"camera {name!r}: ")
+        assert sentence.count("{") == (name in renamed)
+        if name in renamed:
+            assert f"{{{name}: {renamed[name]}}}" in sentence
 
 
 def test_all_differences_are_told_at_once() -> None:
@@ -364,3 +390,37 @@ def test_a_tensor_that_numpy_cannot_read_is_no_action() -> None:
 
     with pytest.raises(InvalidAction, match=r"expected .*, got RequiresGrad"):
         check_action(RequiresGrad(), None)
+
+
+class TakesOptions(Agent):
+    def reset(
+        self, obs: Obs, instruction: str | None, *, weight: float = 1.0, **kwargs: Any
+    ) -> dict[str, Any]:
+        return {}
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("checkpoint", "a replica has only one"),
+        ("checkpoint_step", "a replica has only one"),
+        ("chekpoint", "did you mean 'checkpoint'"),
+        ("checkpoint_steps", "did you mean 'checkpoint_step'"),
+        ("weigths", "did you mean 'weights'"),
+        ("weight", None),  # a parameter of this policy's `reset`
+        ("seed", None),
+        ("speed", None),
+        ("env", None),
+        ("temperature", None),
+    ],
+)
+def test_an_option_of_a_reset_with_almost_the_name_of_a_known_one_is_refused(
+    option: str, message: str | None
+) -> None:
+    if message is None:
+        check_options(TakesOptions(), {option: 1})
+        return
+    with pytest.raises(InvalidInput, match=message):
+        check_options(TakesOptions(), {option: 1})
+    with pytest.raises(InvalidInput, match="did you mean 'weights'"):
+        check_options(Agent(), {"weight": 1})

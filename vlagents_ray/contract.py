@@ -259,12 +259,16 @@ def _camera_differences(policy: Contract, env: Contract) -> Iterator[str]:
     if env.cameras is None:
         return
 
+    renamed = _renamed_cameras(policy.cameras or {}, env.cameras)
     for name, needed in (policy.cameras or {}).items():
         provided = env.cameras.get(name)
         if provided is None:
             cure = "add or rename a camera of the env"
-            if env.cameras:
-                cure += f", or set the policy's `cameras`, such as {{{name}: {min(env.cameras)}}}"
+            if name in renamed:
+                cure += (
+                    f", with {{{name}: {renamed[name]}}} in `env_options.cameras` of a Gymnasium "
+                    "env, or in the policy's `cameras` if it has this setting"
+                )
             yield (
                 f"camera {name!r}: the policy needs it, the env provides {sorted(env.cameras)}; "
                 f"{cure}"
@@ -275,6 +279,26 @@ def _camera_differences(policy: Contract, env: Contract) -> Iterator[str]:
                 f"x width), the env provides {provided.height}x{provided.width}; set the env's "
                 "camera size"
             )
+
+
+def _renamed_cameras(
+    needed: Mapping[str, CameraSpec], provided: Mapping[str, CameraSpec]
+) -> dict[str, str]:
+    """Return the env's path of each camera that the policy needs under the last part of that path,
+    such as "top" for "images/top".
+
+    Names that are only similar are not matched: no later check finds the picture of the left wrist
+    in the input of the right one.
+    """
+    paths: dict[str, list[str]] = {}
+    for path in provided:
+        paths.setdefault(path.rpartition("/")[2].lower(), []).append(path)
+    renamed: dict[str, str] = {}
+    for name in needed:
+        matches = paths.get(name.lower(), [])
+        if name not in provided and len(matches) == 1 and matches[0] not in needed:
+            renamed[name] = matches[0]
+    return renamed
 
 
 def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:

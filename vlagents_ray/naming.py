@@ -39,12 +39,18 @@ def distinct(names: Iterable[str], simplify: Callable[[str], str] = plain) -> di
     return simplified
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: str, known: Iterable[str], similarity: float = 0.6) -> str:
     """Return a suggestion for the end of a message, such as "; did you mean 'scripted'?"; "" if no
     known name is similar to `name`.
+
+    Args:
+        name: The name that is unknown.
+        known: The names that exist.
+        similarity: Smallest similarity of a suggested name, from 0 to 1 for an equal name, as in
+            `difflib.SequenceMatcher.ratio`.
     """
     by_lower = {known_name.lower(): known_name for known_name in known}
-    close = difflib.get_close_matches(name.lower(), by_lower, n=1)
+    close = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=similarity)
     return f"; did you mean {by_lower[close[0]]!r}?" if close else ""
 
 

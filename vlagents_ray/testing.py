@@ -31,9 +31,16 @@ import numpy as np
 from vlagents_ray.abilities import Prepares, Sleeps, Trainable, ability, members
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, kind_of
-from vlagents_ray.errors import InvalidAction, InvalidObservation, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidAction,
+    InvalidObservation,
+    UnknownSession,
+    VLAgentsError,
+)
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.validation import check_action, check_observation
+from vlagents_ray.policies.agent_copies import AgentCopies
+from vlagents_ray.validation import check_action, check_observation, check_reset
 
 __all__ = ["ContractViolation", "check_agent", "check_env"]
 
@@ -182,11 +189,11 @@ def check_agent(
     """Check that an agent implements the interface of `Agent`; initializes and closes the agent.
 
     Three sessions, which are copies of the initialized agent, each receive an observation, an
-    instruction and a seed. They run in sequence, interleaved, with prepared observations, and in
-    batches of 1, 2 and 3. The actions of a session must not depend on the other sessions, nor on
-    whether `prepare` was called. If the agent defines `prepare`, several threads call it while
-    others call `reset` and `act`, as in a server, and every result must equal that of a single
-    thread.
+    instruction and a seed. They run in sequence, interleaved, with a move to another replica after
+    each step, with prepared observations, and in batches of 1, 2 and 3. The actions of a session
+    must not depend on the other sessions, nor on moves, nor on whether `prepare` was called. If the
+    agent defines `prepare`, several threads call it while others call `reset` and `act`, as in a
+    server, and every result must equal that of a single thread.
 
     Args:
         agent: The agent, not initialized yet.
@@ -209,6 +216,10 @@ def check_agent(
             f"{agent!r}"
         )
 
+    try:
+        check_reset(agent)
+    except ConfigError as error:
+        raise ContractViolation(str(error)) from error
     agent.initialize()
     contract = agent.contract
     if contract is not None and not isinstance(contract, Contract):
@@ -243,27 +254,50 @@ def check_agent(
                 alone[i][step], suite.act(i, session), f"act {step} of session {i}", because
             )
 
+    _check_moves(suite, alone)
     for protocol in (Trainable, Sleeps):
         _require_whole(agent, protocol)
 
-    # Run with prepared observations, also from several threads.
     if ability(agent, Prepares) is not None:
-        because = "`act` must compute the same with and without `prepare`"
-        for i, session in enumerate([suite.begin(i) for i in range(_SESSIONS)]):
-            for step in range(steps):
-                where = f"act {step} of session {i} on a prepared observation"
-                require_same(alone[i][step], suite.act(i, session, prepared=True), where, because)
-        _check_threads(suite, [acts[0] for acts in alone])
-
-    # Run in batches.
-    because = "act_batch must return the action that act returns for the session alone"
-    for size in range(1, _SESSIONS + 1):
-        batch = [suite.begin(i) for i in range(size)]
-        for step in range(steps):
-            for i, act in enumerate(suite.act_batch(batch)):
-                where = f"act {step} of session {i} in a batch of {size}"
-                require_same(alone[i][step], act, where, because, atol)
+        _check_prepared(suite, alone)
+    _check_batches(suite, alone, atol)
     check_close(agent)
+
+
+def _check_moves(suite: _AgentSuite, alone: Sequence[Sequence[Act]]) -> None:
+    """Move each session to another replica after each step; it must act as without moves.
+
+    After a move, `act` may raise `UnknownSession`, if the state of the episode is not in this
+    process, but in a connection to another server. The client then begins again.
+    """
+    because = (
+        "a session that moves to another replica must continue there: keep the state of an episode "
+        "in attributes that can be pickled"
+    )
+    copies = suite.copies()
+    for i in range(_SESSIONS):
+        session = suite.reset(i, copies.make())
+        for step, act in enumerate(alone[i]):
+            try:
+                again = suite.act(i, session)
+            except ContractViolation as error:
+                if step and isinstance(error.__cause__, UnknownSession):
+                    return
+                raise
+            require_same(act, again, f"act {step} of session {i} after a move", because)
+            session = _moved(session, copies)
+
+
+def _moved(session: Agent, copies: AgentCopies) -> Agent:
+    """Return the session as another replica of the policy receives it."""
+    try:
+        return copies.load(copies.dump(session))
+    except Exception as error:
+        raise ContractViolation(
+            f"the session cannot be pickled in the middle of its episode: {error!r}; then it "
+            "restarts when its replica stops, instead of moving to another one. Create what cannot "
+            "be pickled in `initialize` and name it in `shared`, or leave it out in __getstate__"
+        ) from error
 
 
 def _require_whole(agent: Agent, protocol: type) -> None:
@@ -276,6 +310,27 @@ def _require_whole(agent: Agent, protocol: type) -> None:
             f"{type(agent).__name__}: expected all of {list(members(protocol))}, the methods of "
             f"{protocol.__name__}, got none named {missing}; define both, or neither"
         )
+
+
+def _check_prepared(suite: _AgentSuite, alone: Sequence[Sequence[Act]]) -> None:
+    """Run the sessions with prepared observations, also from several threads."""
+    because = "`act` must compute the same with and without `prepare`"
+    for i, session in enumerate([suite.begin(i) for i in range(_SESSIONS)]):
+        for step, act in enumerate(alone[i]):
+            where = f"act {step} of session {i} on a prepared observation"
+            require_same(act, suite.act(i, session, prepared=True), where, because)
+    _check_threads(suite, [acts[0] for acts in alone])
+
+
+def _check_batches(suite: _AgentSuite, alone: Sequence[Sequence[Act]], atol: float) -> None:
+    """Run the sessions in batches of each size."""
+    because = "act_batch must return the action that act returns for the session alone"
+    for size in range(1, _SESSIONS + 1):
+        batch = [suite.begin(i) for i in range(size)]
+        for step in range(len(alone[0])):
+            for i, act in enumerate(suite.act_batch(batch)):
+                where = f"act {step} of session {i} in a batch of {size}"
+                require_same(alone[i][step], act, where, because, atol)
 
 
 def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:
@@ -339,8 +394,12 @@ class _AgentSuite:
         "it accepts: check_agent(…, instructions=[…], obs=[…])"
     )
 
+    def copies(self) -> AgentCopies:
+        """Return the copies that a server makes of the initialized agent."""
+        return AgentCopies(self._agent)
+
     def begin(self, i: int) -> Agent:
-        """Begin session `i`: copy the agent except for its shared objects, and reset the copy."""
+        """Begin session `i` with a copy of the agent except for its shared objects."""
         shared = {id(value): value for value in self._agent.shared_objects() if value is not None}
         try:
             session = copy.deepcopy(self._agent, dict(shared))
@@ -350,6 +409,10 @@ class _AgentSuite:
                 f"name the attributes that sessions may share in `shared`"
             ) from error
 
+        return self.reset(i, session)
+
+    def reset(self, i: int, session: Agent) -> Agent:
+        """Reset a copy of the agent for session `i`, and return it."""
         obs = self._views[i]
         before = copy.deepcopy(obs)
         with self._calling("reset", i):

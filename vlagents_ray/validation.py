@@ -1,25 +1,73 @@
-"""Checks of observations and actions against a policy's contract."""
+"""Checks of observations and actions against a policy's contract, and of a policy's `reset`."""
 
 from __future__ import annotations
 
+import inspect
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from vlagents_ray.contract import Contract, _differ
 from vlagents_ray.errors import (
+    ConfigError,
     InvalidAction,
+    InvalidInput,
     InvalidObservation,
     MissingCamera,
     MissingState,
     NotOffered,
 )
-from vlagents_ray.interface import WANT, Obs
+from vlagents_ray.interface import WANT, Agent, Obs
+from vlagents_ray.naming import did_you_mean
 
 # Limit of the absolute value of an action's numbers; larger numbers are meaningless in any unit.
 LARGEST_ACTION = 1e9
+# Names that select a checkpoint in a policy's settings, but not at a reset.
+_CHECKPOINT_OPTIONS = frozenset({"checkpoint", "checkpoint_step"})
+# Options of a reset whose misspelling is found: these, and the weights of a learner
+# (`serve.weights`). Shorter names, such as `seed`, are too similar to other words.
+_KNOWN_OPTIONS = sorted({*_CHECKPOINT_OPTIONS, "weights"})
+_MISSPELT = 0.8  # similarity of two names from which one is a misspelling of the other
 _SMALL = 64  # largest array size for which Python's own check is faster than numpy's
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
+
+
+def check_reset(agent: Agent) -> None:
+    """Raise `ConfigError` unless `agent.reset` accepts the options that every episode has."""
+    signature = inspect.signature(agent.reset)
+    try:
+        signature.bind(Obs(), "", seed=0, env="")
+    except TypeError as error:
+        raise ConfigError(
+            f"{type(agent).__name__}.reset: expected the parameters (obs, instruction, **kwargs), "
+            f"got {signature} ({error}); episodes pass `seed`, evaluations also `env`, and clients "
+            "may pass further options: add **kwargs"
+        ) from error
+
+
+def check_options(agent: Agent, options: Mapping[str, Any]) -> None:
+    """Raise `InvalidInput` if an option of a reset selects a checkpoint, or has almost the name of
+    an option that the server knows.
+
+    A policy's own options are free, so a misspelt name would have no effect, and no error would
+    tell the client. Options that the policy's `reset` names as parameters are accepted.
+    """
+    for name in options:
+        suggestion = did_you_mean(name, _KNOWN_OPTIONS, similarity=_MISSPELT)
+        is_known = name in _KNOWN_OPTIONS and name not in _CHECKPOINT_OPTIONS
+        if not suggestion or is_known or name in inspect.signature(agent.reset).parameters:
+            continue
+        if name in _CHECKPOINT_OPTIONS:
+            raise InvalidInput(
+                f"reset: the option {name!r} selects no checkpoint, as a replica has only one; "
+                "call the application that serves the other checkpoint"
+            )
+        raise InvalidInput(
+            f"reset: the policy's `reset` has no parameter {name!r}{suggestion} If {name!r} is "
+            "meant, name it among the parameters"
+        )
 
 
 def check_observation(obs: Obs, contract: Contract | None) -> None:

@@ -28,8 +28,8 @@ from vlagents_ray.abilities import (
     members,
     observation_arguments,
 )
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.policies.wrapper import Wrapper
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
 
 

@@ -13,9 +13,9 @@ import pytest
 
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies import agent_copies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.serve import sessions
-from vlagents_ray.serve.models import agent_copies
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.requests import Origin
 from vlagents_ray.serve.sessions import Outdated, Session, SessionTable
 

@@ -237,6 +237,24 @@ class AgentClosesOnce(GoodAgent):
         self.closed = True
 
 
+class LocksInReset(GoodAgent):
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.lock = threading.Lock()
+        return super().reset(obs, instruction, **kwargs)
+
+
+class ForgetsItsCount(GoodAgent):
+    """A policy whose state leaves out what later actions depend on."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "count": 0}
+
+
+class TakesNoSeed(GoodAgent):
+    def reset(self, obs: Obs, instruction: str | None) -> dict[str, Any]:  # type: ignore[override]
+        return super().reset(obs, instruction)
+
+
 BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     (CannotCopy, "cannot be copied.*`shared`"),
     (SharesItsCount, "depends on other sessions"),
@@ -300,6 +318,9 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     (with_contract({}), "contract: expected a Contract or None, got dict"),
     (with_reset(lambda *_: None), "reset: expected a dict, got NoneType"),
     (with_reset(lambda agent, _: {"agent": agent}), r"info\['agent'\]"),
+    (LocksInReset, "session cannot be pickled in the middle of its episode.*lock"),
+    (ForgetsItsCount, "act 1 of session 0 after a move.*must continue there"),
+    (TakesNoSeed, r"TakesNoSeed.reset: expected the parameters \(obs, instruction, \*\*kwargs\)"),
     (SleepsForEver, r"expected all of \['sleep', 'wake'\].*got none named \['wake'\]"),
     (AgentClosesOnce, "the second call raised"),
 ]

@@ -14,7 +14,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -64,7 +63,9 @@ class Chunk(NamedTuple):
     step: int  # `ChunkBuffer.executed` at the chunk's observation: the position of the first row
     rows: np.ndarray  # (H, D) float32
     done: bool = False
-    info: Mapping[str, Any] = MappingProxyType({})  # the info of the policy's Act
+    # The info of the policy's Act. Not a `MappingProxyType`: when a session moves, its chunks are
+    # pickled.
+    info: Mapping[str, Any] = {}
     tick: int = 0  # the tick of the observation
     seen_at: float = 0.0  # capture time of the observation, s of `time.monotonic`
 

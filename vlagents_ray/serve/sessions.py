@@ -1,7 +1,7 @@
 """Sessions: each serves one robot or one env, with private state and shared weights.
 
 The private state of a session is a copy of the loaded agent
-(`vlagents_ray.serve.models.agent_copies`). A session can move to another replica of the same
+(`vlagents_ray.policies.agent_copies`). A session can move to another replica of the same
 policy, together with that copy.
 """
 

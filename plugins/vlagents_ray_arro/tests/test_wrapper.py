@@ -24,11 +24,11 @@ from vlagents_ray.errors import (
     NotReset,
     UnknownWrapper,
 )
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.registry import wrapper_class
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
 from vlagents_ray_arro import Arro, ArroConfig
 from vlagents_ray_arro.parts import Detection

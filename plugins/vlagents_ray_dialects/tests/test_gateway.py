@@ -18,12 +18,12 @@ from served_agents import Witness
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Obs
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.dialects import gateway as module
 from vlagents_ray.serve.dialects.base import ImplicitEpisode
 from vlagents_ray.serve.dialects.gateway import Gateway, ServedPolicy
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray_dialects.gateway_sessions import GatewaySessions
 from vlagents_ray_dialects.upstream import Upstream

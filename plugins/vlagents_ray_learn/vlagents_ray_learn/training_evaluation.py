@@ -18,8 +18,8 @@ from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.evaluate.run import evaluate
 from vlagents_ray.interface import POLICY, Act, Agent, Obs
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.policies.wrapper import require_trainable, unwrapped
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.weights.trainable import evaluation_mode, fingerprint
 
 

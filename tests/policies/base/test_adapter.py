@@ -18,13 +18,13 @@ from pushed_weights import check_pushed_weights
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray.policies.base.adapter import LoraAdapter
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray.weights.trainable import portable
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
-from in_flight import Calls, arrived, ask, pending, send
+from in_flight import Calls, answered, arrived, ask, pending, send
 
 from vlagents_ray.errors import (
     DeadlineExceeded,
@@ -58,6 +58,20 @@ class Gated(Agent):
         if "error" in obs[0].info:
             raise obs[0].info["error"]
         return super().act_batch(obs, sessions)
+
+
+def test_a_misspelt_option_of_a_reset_is_refused() -> None:
+    """The policy would ignore it, and act with other settings than the client believes."""
+    engine = Engine(Gated())
+    engine.start()
+    try:
+        request = Request("reset", obs=Obs(), kwargs={"chekpoint_step": 600})
+        error = answered(engine, "robot", request).error
+        assert isinstance(error, InvalidInput)
+        assert "did you mean 'checkpoint_step'" in str(error)
+        assert answered(engine, "robot", Request("reset", obs=Obs())).error is None
+    finally:
+        engine.close()
 
 
 class Served:

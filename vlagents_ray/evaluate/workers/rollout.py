@@ -47,10 +47,12 @@ from vlagents_ray.policies.base.accelerator import free_memory
 from vlagents_ray.policies.base.checkpoint import CHECKPOINT_STEP, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import identify_weights
 from vlagents_ray.policies.base.program import Program, code_of_class, files_named, loaded_code
+from vlagents_ray.policies.wrapper import unwrapped
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.protocol.messages import PriorityName
 from vlagents_ray.ray_tools.git_state import code_of
 from vlagents_ray.registry import env_class
+from vlagents_ray.validation import check_reset
 
 log = logging.getLogger(__name__)
 
@@ -262,6 +264,7 @@ class Rollout:
         with policy_side("start"):
             agent = self._agent_factory(case)
         try:
+            check_reset(unwrapped(agent))
             with policy_side("initialize"), used_checkpoints() as checkpoints:
                 agent.initialize()
                 # Fetch the metadata, to check that the server runs and has the policy.

@@ -26,6 +26,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import REPLAN, Act
+from vlagents_ray.policies.wrapper import unwrapped
 from vlagents_ray.protocol.messages import Priority, Reply
 from vlagents_ray.serve.engine.ability_call import AbilityCall
 from vlagents_ray.serve.engine.intake import Intake
@@ -43,6 +44,7 @@ from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.requests import Answer, Opening, PendingRequest, ReservedAct, deliver
 from vlagents_ray.serve.sessions import Session, SessionState
 from vlagents_ray.serve.weights import WeightsVersion
+from vlagents_ray.validation import check_options
 
 logger = logging.getLogger(__name__)
 
@@ -287,6 +289,7 @@ class Runner:
         if request.obs is None:  # the decoder ensures that a reset has an observation
             raise PolicyFailed("reset: expected an observation, got none")
         model.check(request)
+        check_options(unwrapped(model.agent), opening.kwargs)
 
         with model.busy, model.uncaptured, model.call("reset") as call:
             model.require_open()

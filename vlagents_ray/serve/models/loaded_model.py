@@ -19,6 +19,7 @@ from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.act_stream import ActStream, GpuCalls
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.policies.base.checkpoint import (
     CHECKPOINT,
     checkpoint_name,
@@ -30,10 +31,9 @@ from vlagents_ray.policies.base.program import Program, digest_of, files_named, 
 from vlagents_ray.policies.loading import LoadingReport, loading_report
 from vlagents_ray.policies.wrapper import unwrapped
 from vlagents_ray.protocol.messages import Request
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
 from vlagents_ray.serve.weights import HoldsWeights, ModelWeights
-from vlagents_ray.validation import check_observation
+from vlagents_ray.validation import check_observation, check_reset
 
 logger = logging.getLogger(__name__)
 
@@ -311,6 +311,7 @@ class Loader:
     def _load(self, settings: Mapping[str, Any], on_progress: Callable[[str], None]) -> LoadedModel:
         agent = self._make(settings)
         try:
+            check_reset(unwrapped(agent))
             with (
                 used_checkpoints() as checkpoints,
                 loading_report(

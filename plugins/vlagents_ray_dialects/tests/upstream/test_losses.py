@@ -24,7 +24,7 @@ from vlagents_ray.abilities import ChecksHealth, ability
 from vlagents_ray.errors import ConnectionLost, NoReplica, PolicyUnavailable, UnknownSession
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Obs
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray_dialects.messages import openpi, vla_eval
 from vlagents_ray_dialects.upstream import Upstream, websocket

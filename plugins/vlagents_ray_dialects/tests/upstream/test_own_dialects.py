@@ -12,13 +12,13 @@ from dialect_server import METADATA
 from served_agents import Mirror
 
 from vlagents_ray.interface import Obs
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray_dialects.upstream import Upstream
 
 DIALECTS: dict[str, Any] = {

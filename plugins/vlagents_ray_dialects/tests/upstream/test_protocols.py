@@ -14,7 +14,7 @@ from upstream_servers import BROKEN, answer, gr00t_actions, upstreams
 
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Obs
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray.testing import check_agent
 from vlagents_ray_dialects.upstream import Upstream

@@ -23,7 +23,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Obs
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray_dialects.upstream import Upstream
 

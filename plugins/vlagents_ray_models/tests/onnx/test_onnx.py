@@ -19,12 +19,12 @@ from onnx.parser import parse_model
 from vlagents_ray import Act, Obs
 from vlagents_ray.contract import CameraSpec, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.policies.base import accelerator
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.model_inputs import resize_with_pad
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.testing import check_agent
 from vlagents_ray_models.onnx import Onnx

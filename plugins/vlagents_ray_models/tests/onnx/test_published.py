@@ -15,7 +15,7 @@ from generated import RATES
 from in_process_replicas import Replicas
 
 from vlagents_ray import Act, Obs
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.serve.python_env.create import install
 from vlagents_ray_models.onnx import Onnx
 

@@ -10,7 +10,7 @@ import pytest
 
 from vlagents_ray import Act, Obs
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
 from vlagents_ray_models.onnx import Onnx
 

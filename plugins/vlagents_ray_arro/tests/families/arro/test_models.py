@@ -12,7 +12,7 @@ from tiny_arro import make_grounding_dino, make_sam2
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray_arro import Arro
 from vlagents_ray_arro.parts import make_part
 

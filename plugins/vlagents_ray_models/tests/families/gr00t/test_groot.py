@@ -27,7 +27,7 @@ from vlagents_ray import Obs
 from vlagents_ray.contract import CameraSpec, StateSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import SAMPLES, Act
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray_models.lerobot import LeRobot
 
 pytestmark = FILTERS

@@ -15,7 +15,7 @@ from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
 from plugins.vlagents_ray_models.tests.families.lerobot import tiny
 from vlagents_ray import Obs
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray_models.lerobot import LeRobot
 from vlagents_ray_models.lerobot.samplers import LONGEST_PREFIX
 

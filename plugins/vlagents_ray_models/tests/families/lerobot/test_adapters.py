@@ -29,7 +29,7 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.dataset_contract import DatasetContract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, Act
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray_models.lerobot import LeRobot
 
 pytestmark = FILTERS

@@ -30,9 +30,9 @@ from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.envs import make_env
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.overrides import parse_settings
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.robot.record import Recorder
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray_models.lerobot import LeRobot
 from vlagents_ray_results.lerobot import to_lerobot
 

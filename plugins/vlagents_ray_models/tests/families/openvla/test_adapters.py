@@ -21,7 +21,7 @@ from plugins.vlagents_ray_models.tests.families.openvla.conftest import LIBRARIE
 from plugins.vlagents_ray_models.tests.families.openvla.upstream import module
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray_models.openvla.policy import OpenVLA
 

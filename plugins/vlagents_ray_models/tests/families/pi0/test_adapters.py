@@ -17,8 +17,8 @@ from pushed_weights import check_pushed_weights
 from plugins.vlagents_ray_models.tests.families.pi0.conftest import WORDS, made, seen
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.policies.loading import LoadingReport
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray_models.pi0 import Pi0
 
 ATOL = 1e-4  # of actions of size 1, which ten steps of a flow and the merged sums round differently

@@ -23,7 +23,7 @@ from plugins.vlagents_ray_models.tests.families.vjepa2_ac.tiny import (
 from vlagents_ray import Act, Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import DISTRIBUTION, GOAL_IMAGE, SAMPLES
-from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
 from vlagents_ray_models.vjepa2_ac import VJepa2Ac
 
