@@ -5,7 +5,7 @@ calls.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -27,8 +27,8 @@ from vlagents_ray.errors import (
     PolicyFailed,
     UnknownPolicy,
 )
+from vlagents_ray.policies.agent_copies import AgentCopies
 from vlagents_ray.policies.wrapper import Wrapper, build_agent, require_trainable
-from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
 
 
@@ -158,6 +158,56 @@ def test_a_class_that_is_no_agent_is_refused() -> None:
         UnknownPolicy, match="'json:JSONDecoder': expected an Agent; derive the class"
     ):
         build_agent("json:JSONDecoder", {})
+
+
+class Weights(BaseModel, extra="forbid"):
+    weights: str
+    scale: float = 1.0
+
+
+class WeightsWithStep(Weights):
+    checkpoint_step: int | None = None
+
+
+class Loads(Agent):
+    """A policy that loads a file, with settings of its own."""
+
+    Config: ClassVar[Any] = Weights
+
+    def __init__(self, config: Weights) -> None:
+        self.config = config
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(1, np.float32))
+
+
+class LoadsAtStep(Loads):
+    Config = WeightsWithStep
+
+
+class LoadsByArgument(Agent):
+    """A policy whose settings are the arguments of its constructor."""
+
+    def __init__(self, weights: str) -> None:
+        self.config = Weights(weights=weights)
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(1, np.float32))
+
+
+@pytest.mark.parametrize("cls", [Loads, LoadsAtStep, LoadsByArgument])
+def test_the_step_of_a_sweep_is_filled_into_the_settings_of_any_policy(cls: type[Agent]) -> None:
+    settings = {"weights": "runs/a/w{step}.pt", "checkpoint_step": 700}
+    agent: Any = build_agent(f"{__name__}:{cls.__name__}", settings)
+    assert agent.config.weights == "runs/a/w700.pt"
+    assert getattr(agent.config, "checkpoint_step", 700) == 700
+    assert settings["weights"] == "runs/a/w{step}.pt"
+
+
+@pytest.mark.parametrize("cls", [Loads, LoadsByArgument])
+def test_a_step_without_a_place_is_refused_with_the_cure(cls: type[Agent]) -> None:
+    with pytest.raises(ConfigError, match=r"expected \{step\} in a setting.*training step 700"):
+        build_agent(f"{__name__}:{cls.__name__}", {"weights": "w.pt", "checkpoint_step": 700})
 
 
 def test_what_keeps_the_inner_agent_from_acting_is_said_by_the_wrapper_too() -> None:

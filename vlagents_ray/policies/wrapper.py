@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar, cast
 
 from vlagents_ray.abilities import (
@@ -16,6 +17,7 @@ from vlagents_ray.abilities import (
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, NotTrainable, UnknownPolicy
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.base.checkpoint import CHECKPOINT, CHECKPOINT_STEP, STEP, at_step
 from vlagents_ray.policies.outcomes import compute_valid
 from vlagents_ray.registry import find_entry, policy_class, wrapper_class
 from vlagents_ray.settings import wrong_settings
@@ -198,7 +200,7 @@ def build_agent(
 
     Args:
         policy: A registered name, or "module:Class".
-        config: The settings of the policy.
+        config: The settings of the policy. `checkpoint_step` replaces `{step}` in the texts.
         wrappers: Names, or {name: settings}. The first one is the outermost wrapper, which receives
             the robot's observations.
 
@@ -219,6 +221,8 @@ def build_agent(
             f"policy {policy!r}: expected a class that defines act or act_batch, got {cls.__name__}"
         )
 
+    if CHECKPOINT_STEP in config:
+        config = _at_step(policy, cls, config)
     try:
         agent: Agent = cls.from_config(config)
     except ConfigError as error:
@@ -227,6 +231,39 @@ def build_agent(
     for entry in reversed(wrappers):
         agent = _wrapped(agent, entry)
     return agent
+
+
+def _at_step(policy: str, cls: type[Agent], config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings with the training step in each text that contains `{step}`, so that a
+    class needs no setting of its own for it.
+
+    The settings of a class that replaces `{step}` itself, see `ModelConfig.replaces_step`, are
+    returned as they are.
+
+    Raises:
+        ConfigError: The class has no setting `checkpoint_step`, and no text contains `{step}`.
+    """
+    if getattr(cls.Config, "replaces_step", False):
+        return dict(config)
+
+    step = config[CHECKPOINT_STEP]
+    settings: dict[str, Any] = {}
+    for name, value in config.items():
+        settings[name] = at_step(value, step) if isinstance(value, str) else value
+    if CHECKPOINT_STEP not in (getattr(cls.Config, "model_fields", None) or _parameters(cls)):
+        del settings[CHECKPOINT_STEP]
+        if all(settings[name] == config[name] for name in settings):
+            raise ConfigError(
+                f"policy {policy!r}: expected {STEP} in a setting, which stands for the training "
+                f"step {step}, got {dict(settings)}; write it there, such as "
+                f"{CHECKPOINT}: runs/a/{STEP}, or give the class a setting `{CHECKPOINT_STEP}`"
+            )
+    return settings
+
+
+def _parameters(cls: type[Agent]) -> Collection[str]:
+    """Return the names of the arguments with which a class is constructed."""
+    return inspect.signature(cls).parameters
 
 
 def _wrapped(agent: Agent, entry: str | Mapping[str, Mapping[str, Any]]) -> Wrapper:

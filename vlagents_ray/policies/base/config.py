@@ -6,7 +6,7 @@ Each family adds settings and restricts the values of these.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 from typing_extensions import Self
@@ -34,6 +34,10 @@ class ModelConfig(BaseModel, extra="forbid"):
     """The settings of a model: its checkpoint, its device, its inputs, and how its chunks become
     actions.
     """
+
+    # Whether a policy of these settings replaces `{step}` itself. `find_checkpoint` also looks for
+    # the step with leading zeros, as in LeRobot's folders.
+    replaces_step: ClassVar[bool] = True
 
     checkpoint: str = Field(
         min_length=1,

@@ -15,7 +15,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, UnknownPolicy
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.overrides import YAML_SUFFIXES, Override, read_config_file, with_overrides
-from vlagents_ray.policies.base.checkpoint import CHECKPOINT, CHECKPOINT_STEP, STEP
+from vlagents_ray.policies.base.checkpoint import CHECKPOINT_STEP, STEP
 from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import find_entry, policy_class
@@ -455,7 +455,8 @@ def _require_policy(
         return
 
     args.dialects.require_packages()
-    lacks_step = STEP in str(config.get(CHECKPOINT)) and config.get(CHECKPOINT_STEP) is None
+    has_place = any(isinstance(value, str) and STEP in value for value in config.values())
+    lacks_step = has_place and config.get(CHECKPOINT_STEP) is None
     settings = config | {CHECKPOINT_STEP: 0} if step_follows and lacks_step else config
     args.dialects.require_fit(_contract(args, settings))
 
