@@ -211,6 +211,8 @@ class RemoteAgent(Agent):
         [info] = self.reset_batch([obs], [instruction], [self], contract=contract, **kwargs)
         if isinstance(info, Exception):
             raise info
+        if self._commands is not None:
+            self._commands.begin_episode()
         return info
 
     def reset_batch(

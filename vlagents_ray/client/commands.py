@@ -17,7 +17,8 @@ COMMAND = "command"  # the entry of `Act.info` with a command: {"id", "do", "by"
 # The entry of `Obs.info` with the outcomes of commands, by id: the reason of the rejection, or ""
 # if the command was executed.
 COMMANDED = "commanded"
-COMMANDS = ("pause", "stop", "success", "failure")  # no command can start a motion
+MARKS = ("success", "failure")  # the commands that end an episode with an outcome
+COMMANDS = ("pause", "stop", *MARKS)  # no command can start a motion
 logger = logging.getLogger(__name__)
 _NAME_CHARACTERS = 80  # the maximum length of a name from the network; longer names are truncated
 
@@ -98,6 +99,20 @@ class CommandInbox:
     def waiting(self) -> list[Command]:
         """The received commands that have not been executed yet, oldest first."""
         return list(self._waiting)
+
+    def begin_episode(self) -> None:
+        """Reject the marks that have not been applied yet, since they are about an earlier episode;
+        `RemoteAgent.reset` calls this method.
+
+        Stops and pauses remain: they only hold the robot.
+        """
+        waiting = list(self._waiting)
+        self._waiting.clear()
+        for command in waiting:
+            if command.do in MARKS:
+                self._outcomes[command.id] = f"{command.do}: its episode has ended"
+            else:
+                self._waiting.append(command)
 
     def apply(self, control: RobotControl) -> list[Command]:
         """Apply the commands that arrived since the last call to the state of the robot, and return

@@ -600,6 +600,8 @@ def run_loop(
             run.drive(pacer, seconds, is_over)
             run.go_to_rest(pacer)
 
+            if options.commands is not None:
+                options.commands.apply(control)  # of the answer to the last request
             report.outcome = control.end()
             if report.outcome and recorder is not None and recorder.interventions:
                 recorder.label("success" if report.outcome == "success" else "failure")

@@ -4,12 +4,13 @@ outcomes.
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -24,14 +25,14 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.robot import main
 from vlagents_ray.client.commands import COMMAND, COMMANDED, CommandInbox
 from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession
-from vlagents_ray.interface import Act
+from vlagents_ray.interface import Act, Agent
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.robot.loop import LoopOptions, LoopReport, run_loop
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.sessions import SessionTable
 from vlagents_ray_live import live_page
-from vlagents_ray_live.commands import CommandBoard
+from vlagents_ray_live.commands import CommandBoard, episode_of
 
 
 class Board:
@@ -43,8 +44,15 @@ class Board:
         self.sessions.open("arm")
         self.board = CommandBoard(self.sessions, clock=self.clock)
 
-    def press(self, do: str) -> str:
-        return str(self.board.press("arm", do, "lab")["id"])
+    def press(self, do: str, episode: str | None = None) -> str:
+        return str(self.board.press("arm", do, "lab", episode)["id"])
+
+    @property
+    def episode(self) -> str:
+        return episode_of(self.sessions.get("arm"))
+
+    def begin_episode(self) -> None:
+        self.sessions.get("arm").first += 1
 
     def answered(self, **info: Any) -> dict[str, Any] | None:
         """Answer a request with this info, and return the command in the answer."""
@@ -95,6 +103,27 @@ def test_a_command_that_waited_for_too_long_never_reaches_the_robot(board: Board
     board.clock.now += 6.0
     assert board.answered() is None
     assert board.states == ["too late"]
+
+
+@pytest.mark.parametrize("do", ["success", "failure"])
+def test_a_mark_is_never_sent_in_another_episode(board: Board, do: str) -> None:
+    shown = board.episode
+    board.press(do)
+    board.begin_episode()
+    board.press(do, shown)  # the page still showed the earlier episode
+    assert board.answered() is None
+    assert board.states == ["too late", "too late"]
+    [why] = {press["why"] for press in board.board.describe("arm")}
+    assert why == "its episode has ended"
+    pressed = board.press(do, board.episode)
+    assert board.answered() == {"id": pressed, "do": do, "by": "lab"}
+
+
+@pytest.mark.parametrize("do", ["stop", "pause"])
+def test_what_holds_a_robot_is_also_sent_in_the_next_episode(board: Board, do: str) -> None:
+    pressed = board.press(do)
+    board.begin_episode()
+    assert board.answered() == {"id": pressed, "do": do, "by": "lab"}
 
 
 @pytest.mark.parametrize(
@@ -209,6 +238,85 @@ def test_a_robot_pauses_and_is_marked(server: LiveServer) -> None:
         assert post(server, {"session": session, "do": "success"})[0] == 200
         wait_for(lambda: reports, 30)
         assert reports[0].outcome == "success"
+
+
+TICKS = 4  # ticks of an episode
+
+
+class PressingAgent(Agent):
+    """A remote policy, during whose episodes an operator presses a button once.
+
+    Args:
+        agent: The remote policy.
+        press: Presses the button.
+        moment: The number of the call before which it is pressed; half a call later it is pressed
+            after the call.
+        late: The number of the call whose answer is withheld until `run_over`.
+    """
+
+    def __init__(
+        self, agent: RemoteAgent, press: Callable[[], None], moment: float, late: int | None
+    ) -> None:
+        self._agent, self._press, self._moment, self._late = agent, press, moment, late
+        self._calls = 0
+        self.run_over = threading.Event()
+
+    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+        with self._call():
+            return self._agent.reset(obs, instruction, **kwargs)
+
+    def act(self, obs: Obs) -> Act:
+        with self._call():
+            return self._agent.act(obs)
+
+    @contextmanager
+    def _call(self) -> Iterator[None]:
+        number, self._calls = self._calls, self._calls + 1
+        if self._moment == number:
+            self._press()
+        if number == self._late:
+            self.run_over.wait(10)
+        yield
+        if self._moment == number + 0.5:
+            self._press()
+
+
+@pytest.mark.parametrize("late", [None, TICKS - 1, TICKS])
+@pytest.mark.parametrize("moment", [half / 2 for half in range(1, 4 * (TICKS + 1))])
+def test_a_mark_is_of_the_episode_in_which_it_was_pressed(
+    server: LiveServer, moment: float, late: int | None
+) -> None:
+    commands = CommandInbox()
+    pressed: list[int] = []
+    outcomes: list[str] = []
+    with RemoteAgent(server.url, commands=commands) as remote:
+
+        def press() -> None:
+            session = server.engine.sessions.get(remote.session)
+            server.view.press(session.id, "success", "lab", episode_of(session))
+            is_first = not episodes or episodes[0] == episode_of(session)
+            pressed.append(0 if is_first else 1)
+
+        episodes: list[str] = []  # the episodes of the runs that have ended
+        pressing = PressingAgent(remote, press, moment, late)
+        settings = PlayerSettings(mode="async", safe="hold")
+        if late is None:
+            settings = PlayerSettings(execute=1)
+        with ChunkPlayer(pressing, settings) as player:
+            for _ in range(2):
+                ticks = itertools.count()
+                report = run_loop(
+                    Arm(),
+                    player,
+                    hz=100,
+                    until=lambda ticks=ticks: next(ticks) >= TICKS,  # type: ignore[misc]
+                    options=LoopOptions(commands=commands),
+                )
+                outcomes.append(report.outcome)
+                episodes.append(episode_of(server.engine.sessions.get(remote.session)))
+                pressing.run_over.set()
+    for episode, outcome in enumerate(outcomes):
+        assert not outcome or pressed == [episode], (outcomes, pressed)
 
 
 def test_nothing_moves_while_it_is_paused_whatever_comes_over_the_network(

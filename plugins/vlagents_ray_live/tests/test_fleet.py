@@ -36,7 +36,9 @@ class Others:
     async def views(self) -> dict[str, SnapshotReader]:
         return {name: partial(self._read, name) for name in self.names}
 
-    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+    async def press(
+        self, session: str, do: str, by: str, episode: str | None
+    ) -> dict[str, Any] | None:
         return {"do": do, "by": by} if session == "of b" else None
 
     async def _read(self, name: str, since: int, shown: Collection[str]) -> Snapshot:
@@ -76,11 +78,11 @@ def test_pictures_go_to_those_who_show_them(own: ReplicaView) -> None:
 
 def test_a_command_reaches_the_replica_that_has_the_session(own: ReplicaView) -> None:
     gathered = Fleet(own, Others("b"))
-    assert asyncio.run(gathered.press("of b", "stop", "lab")) == {"do": "stop", "by": "lab"}
+    assert asyncio.run(gathered.press("of b", "stop", "lab", None)) == {"do": "stop", "by": "lab"}
     with pytest.raises(UnknownSession):
-        asyncio.run(gathered.press("of c", "stop", "lab"))
+        asyncio.run(gathered.press("of c", "stop", "lab", None))
     with pytest.raises(UnknownSession):
-        asyncio.run(Fleet(own).press("of b", "stop", "lab"))
+        asyncio.run(Fleet(own).press("of b", "stop", "lab", None))
 
 
 def test_a_replica_that_does_not_answer_is_left_out_and_asked_again_from_where_it_was(

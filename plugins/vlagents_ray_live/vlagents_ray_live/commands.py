@@ -5,8 +5,9 @@ only be stopped: it is paused, stopped, or its episode is marked. Commands that 
 (resuming, another instruction, an operator's motion) are given at the robot.
 
 A command is sent in the answer to the robot's next request, within `_WAITS_S` or never, since a
-late command could stop the robot unexpectedly. A later request reports the outcome. The command
-`SAVE` is executed by the server itself.
+late command could stop the robot unexpectedly. A mark belongs to the episode that the caller saw,
+and is never sent in another one; a stop and a pause may be, since they only hold the robot. A later
+request reports the outcome. The command `SAVE` is executed by the server itself.
 """
 
 from __future__ import annotations
@@ -19,18 +20,17 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from vlagents_ray.client.commands import COMMAND, COMMANDED
+from vlagents_ray.client.commands import COMMAND, COMMANDED, MARKS
+from vlagents_ray.client.commands import COMMANDS as ROBOT_COMMANDS
 from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession, VLAgentsError
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.models.loaded_model import LoadedModel
-from vlagents_ray.serve.sessions import SessionTable
+from vlagents_ray.serve.sessions import Session, SessionTable
 
 logger = logging.getLogger(__name__)
 
-TO_ROBOT = ("pause", "stop", "success", "failure")
-"""The commands that are sent to a robot. None of them makes the robot move."""
 SAVE = "save"  # the command with which the server saves the session's last seconds
-COMMANDS = (*TO_ROBOT, SAVE)
+COMMANDS = (*ROBOT_COMMANDS, SAVE)
 
 TRACKED_S = 15.0  # the time for which the outcome of a command is awaited
 _WAITS_S = 5.0  # the time within which a command must reach the robot
@@ -50,8 +50,10 @@ class Press:
     do: str  # the command, one of `COMMANDS`
     by: str  # the name of the caller's key; empty without keys
     pressed: float  # time at which it was pressed, s, of the clock of the board
+    episode: str | None  # the episode of the command, see `episode_of`
     state: State = "waiting"
-    # The reason why the command was rejected, or the folder into which the session was saved.
+    # The reason why the command was rejected or not sent, or the folder into which the session was
+    # saved.
     why: str = ""
     requests: int = 0  # the number of the session's requests since the command was sent
 
@@ -82,13 +84,17 @@ class CommandBoard:
         self._presses: dict[str, list[Press]] = {}  # the commands by session, oldest first
         self._lock = threading.Lock()
 
-    def press(self, session_id: str, do: str, by: str) -> dict[str, Any]:
+    def press(
+        self, session_id: str, do: str, by: str, episode: str | None = None
+    ) -> dict[str, Any]:
         """Accept a command to a session.
 
         Args:
             session_id: The session.
             do: The command, one of `COMMANDS`.
             by: The name of the caller's key.
+            episode: The episode that a mark ends, as in the session's snapshot; default: the
+                running episode.
 
         Returns:
             The description of the command, see `describe`.
@@ -109,11 +115,13 @@ class CommandBoard:
                 f"to another replica"
             )
 
-        pressed = Press(uuid.uuid4().hex, do, by, self._clock())
+        if episode is None:
+            episode = self._running_episode(session_id)
+        pressed = Press(uuid.uuid4().hex, do, by, self._clock(), episode)
         self.forget_others(self._sessions.ids())
         with self._lock:
             presses = self._presses.setdefault(session_id, [])
-            self._expire(presses)
+            self._expire(presses, session_id)
             if len(presses) == _SHOWN:
                 replaced = _replaceable(presses, do)
                 if replaced is None:
@@ -123,6 +131,7 @@ class CommandBoard:
                     )
                 presses.remove(replaced)
             presses.append(pressed)
+            self._expire([pressed], session_id)  # the caller may have seen an earlier episode
 
         if do == SAVE:
             pressed.state = "saving"
@@ -161,7 +170,7 @@ class CommandBoard:
             return
 
         with self._lock:
-            self._expire(presses)
+            self._expire(presses, session_id)
             for press in sorted(presses, key=lambda press: press.do != "stop"):
                 if press.state == "waiting":
                     reply.act.info[COMMAND] = {"id": press.id, "do": press.do, "by": press.by}
@@ -174,7 +183,7 @@ class CommandBoard:
         """
         with self._lock:
             presses = self._presses.get(session_id, [])
-            self._expire(presses)
+            self._expire(presses, session_id)
             return [press.describe() for press in presses]
 
     def forget_others(self, sessions: Collection[str]) -> None:
@@ -194,12 +203,34 @@ class CommandBoard:
             press.why = str(error)[:_REFUSAL]
             press.state = "refused"
 
-    def _expire(self, presses: Collection[Press]) -> None:
-        """Expire the commands that have waited for too long; the caller holds the lock."""
+    def _expire(self, presses: Collection[Press], session_id: str) -> None:
+        """Expire the commands that have waited for too long, and the marks of earlier episodes; the
+        caller holds the lock.
+        """
         oldest = self._clock() - _WAITS_S
+        running_episode = self._running_episode(session_id) if presses else None
         for press in presses:
-            if press.state == "waiting" and press.pressed < oldest:
+            if press.state != "waiting":
+                continue
+            if press.do in MARKS and press.episode != running_episode:
+                press.state, press.why = "too late", "its episode has ended"
+            elif press.pressed < oldest:
                 press.state = "too late"
+                press.why = f"the robot made no request for {_WAITS_S:g} s"
+
+    def _running_episode(self, session_id: str) -> str | None:
+        """Return the running episode of a session; None if the session has ended."""
+        for session in self._sessions.all():
+            if session.id == session_id:
+                return episode_of(session)
+        return None
+
+
+def episode_of(session: Session[LoadedModel]) -> str:
+    """Return the name of a session's running episode for viewers: a text, since JavaScript rounds
+    large integers.
+    """
+    return str(session.first)
 
 
 def _replaceable(presses: Collection[Press], do: str) -> Press | None:

@@ -147,7 +147,7 @@ class _LiveEndpoint:
             command = await _command(http)
         except ClientDisconnect:
             return Response(status_code=499)
-        pressed = await self._fleet.press(command.session, command.do, by)
+        pressed = await self._fleet.press(command.session, command.do, by, command.episode)
         log_pressed(by, f"{command.do!r} for session {command.session!r}")
         return JSONResponse(pressed)
 
@@ -217,6 +217,8 @@ class _Command(BaseModel):
 
     session: str
     do: str
+    # The episode that a mark ends, as in the session's data; default: the running episode.
+    episode: str | None = None
 
 
 async def _command(http: HttpRequest) -> _Command:

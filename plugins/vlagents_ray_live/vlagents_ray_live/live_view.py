@@ -27,7 +27,7 @@ from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.sessions import Session
 from vlagents_ray_live import live
-from vlagents_ray_live.commands import TRACKED_S, CommandBoard
+from vlagents_ray_live.commands import TRACKED_S, CommandBoard, episode_of
 from vlagents_ray_live.ring import LiveConfig, Ring
 
 logger = logging.getLogger(__name__)
@@ -107,19 +107,20 @@ class ReplicaView:
         each_half_second.remove(self.live.expire)
         self.live.close()
 
-    def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+    def press(self, session: str, do: str, by: str, episode: str | None) -> dict[str, Any] | None:
         """Give a command to a session, and wait for its outcome for a limited time.
 
         Args:
             session: The session.
             do: The command, see `CommandBoard.press`.
             by: The name of the caller's key.
+            episode: The episode of a mark, see `CommandBoard.press`.
 
         Returns:
             The description of the command; None if the session is not at this replica.
         """
         try:
-            pressed = self.commands.press(session, do, by)
+            pressed = self.commands.press(session, do, by, episode)
         except UnknownSession:
             return None
         self.live.renew(TRACKED_S)
@@ -233,6 +234,7 @@ def _session(session: Session[LoadedModel], last: live.Answer | None, now: float
         "id": session.id,
         "transport": session.origin.transport,
         "step": session.steps - session.first,
+        "episode": episode_of(session),
         "instruction": session.instruction[:_INSTRUCTION],
         "silent_s": round(time.monotonic() - session.used, 2),
         "version": None if weights is None else weights.number,
@@ -325,7 +327,9 @@ class OtherReplicas(Protocol):
     async def views(self) -> dict[str, SnapshotReader]:
         """Return the readers of the replicas' snapshots, by name."""
 
-    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+    async def press(
+        self, session: str, do: str, by: str, episode: str | None
+    ) -> dict[str, Any] | None:
         """Give a command to a session, see `CommandBoard.press`; return None if no replica has
         the session.
         """
@@ -426,13 +430,14 @@ class Fleet:
                 self._gathering.cancel()
                 self._gathering = None
 
-    async def press(self, session: str, do: str, by: str) -> dict[str, Any]:
+    async def press(self, session: str, do: str, by: str, episode: str | None) -> dict[str, Any]:
         """Give a command to a session of any replica.
 
         Args:
             session: The session.
             do: The command, see `CommandBoard.press`.
             by: The name of the caller's key.
+            episode: The episode of a mark, see `CommandBoard.press`.
 
         Returns:
             The description of the command.
@@ -440,9 +445,9 @@ class Fleet:
         Raises:
             UnknownSession: No replica has the session.
         """
-        pressed = None if self._view is None else self._view.press(session, do, by)
+        pressed = None if self._view is None else self._view.press(session, do, by, episode)
         if pressed is None and self._other_replicas is not None:
-            pressed = await self._other_replicas.press(session, do, by)
+            pressed = await self._other_replicas.press(session, do, by, episode)
         if pressed is None:
             raise UnknownSession(f"session {session[:80]!r}: no replica has it, so it has ended")
         return pressed

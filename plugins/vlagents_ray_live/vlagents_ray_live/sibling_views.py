@@ -46,7 +46,9 @@ class SiblingViews(OtherReplicas):
             }
         return self._views
 
-    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+    async def press(
+        self, session: str, do: str, by: str, episode: str | None
+    ) -> dict[str, Any] | None:
         """Give a command to a session, see `CommandBoard.press`.
 
         Returns:
@@ -56,7 +58,8 @@ class SiblingViews(OtherReplicas):
             VLAgentsError: The replica that has the session rejected the command.
         """
         calls = [
-            sibling.call(ReplicaView.press, session, do, by) for sibling in await self._siblings()
+            sibling.call(ReplicaView.press, session, do, by, episode)
+            for sibling in await self._siblings()
         ]
         for answer in asyncio.as_completed(calls):
             try:

@@ -202,7 +202,7 @@ const OUTCOMES = { // what became of a command
   done: (said) => `${pressed(said)}: done${said.why ? `, in ${said.why}` : ""}`,
   refused: (said) => `${pressed(said)}: refused: ${said.why}`,
   ignored: (said) => `${pressed(said)}: ignored; the robot accepts no commands`,
-  "too late": (said) => `${pressed(said)}: not sent, as the robot made no request for 5 s`,
+  "too late": (said) => `${pressed(said)}: not sent, as ${said.why}`,
 };
 const number = (value) => String(Number(value.toPrecision(3)));
 
@@ -269,6 +269,7 @@ class Card {
     this.operated.hidden = !mayOperate || this.priority !== "robot";
     this.save.hidden = !ring;
     this.save.textContent = `Save last ${ring} s`;
+    this.episode = said.episode; // a mark is for the episode that the person saw
     this.commands(said.commands);
     this.halt(said.commands, said.step);
     if (said.last) this.act(said.last);
@@ -309,7 +310,7 @@ class Card {
     this.say(`${command}: on its way`);
     const headers = { "content-type": "application/json", ...(key ? { authorization: `Bearer ${key}` } : {}) };
     try {
-      const answer = await fetch(`${path()}/command`, { method: "POST", headers, body: JSON.stringify({ session: this.id, do: command }) });
+      const answer = await fetch(`${path()}/command`, { method: "POST", headers, body: JSON.stringify({ session: this.id, do: command, episode: this.episode }) });
       const said = await answer.json();
       if (answer.ok) this.commands([said]); // what came of it may have been shown already; the next message shows it again
       else this.say(`${command}: ${said.detail}`, true);
