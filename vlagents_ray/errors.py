@@ -322,8 +322,8 @@ class EnvFailed(VLAgentsError):
 
 
 class StorageFailed(VLAgentsError):
-    """Results cannot be written, e.g. because the disk is full or the folder is read-only; earlier
-    results are kept.
+    """Results or a recording cannot be written, e.g. because the disk is full or the folder is
+    read-only; earlier results and episodes are kept.
     """
 
 

@@ -19,12 +19,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from eval_fakes import wait_for
+from faulty_disks import FULL, python_on
 
 from vlagents_ray import ConfigError, Obs
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.dataset_contract import BYTES, INFO, STATISTICS, DatasetContract
 from vlagents_ray.datasets.writer import Dataset
-from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.errors import InvalidObservation, StorageFailed
+from vlagents_ray.robot import record as record_module
 from vlagents_ray.robot.record import Recorder
 
 FPS = 25
@@ -245,9 +247,57 @@ def test_a_full_disk_costs_its_episode_and_no_later_one(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     with recorder.episode("stack"):
         recorder.add(obs(0), action(0), tick=0)
-    with pytest.raises(OSError, match="too large"):
+    with pytest.raises(StorageFailed, match=r"too large.*kept: 1, frames of others lost: 100;"):
         recorder.close()
     assert info(tmp_path)["total_episodes"] == 1
+
+
+RECORD_AT_EACH_WRITE = """
+import json, sys
+from pathlib import Path
+import numpy as np
+from faulty_disks import at_each_write
+from vlagents_ray import Obs
+from vlagents_ray.robot import record
+from vlagents_ray.robot.record import Recorder
+record.LEAST_FREE_BYTES = 0
+
+def write(root):
+    with Recorder(root, 25, frames=100) as recorder:
+        for task in ("stack", "unstack"):
+            with recorder.episode(task):
+                for tick in range(4):
+                    camera = np.full((32, 32, 3), 50 * tick, np.uint8)
+                    recorder.add(Obs({"front": camera}), np.zeros(2, np.float32), tick=tick)
+
+def check(root):
+    info = json.loads((root / "meta/info.json").read_text())
+    counted = info["total_episodes"]
+    assert counted >= 2, counted
+    for folder in ("data", "videos/observation.images.front", "meta/episodes"):
+        files = sorted(path.name[:8] for path in (root / folder).glob("*/*"))
+        assert files == [f"file-{number:03d}" for number in range(counted)], (folder, files)
+    assert not (root / "unfinished").exists()
+
+print("failed writes:", at_each_write(Path(sys.argv[1]), write, check))
+"""
+
+
+@pytest.mark.hosts
+def test_a_disk_that_fills_at_any_write_costs_one_episode_and_no_later_one(tmp_path: Path) -> None:
+    done = python_on(FULL, tmp_path, RECORD_AT_EACH_WRITE, size="4m,nr_inodes=400")
+    assert done.returncode == 0, done.stderr
+    [line] = done.stdout.splitlines()
+    assert int(line.removeprefix("failed writes: ")) > 20
+
+
+def test_a_recording_does_not_begin_without_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record_module, "LEAST_FREE_BYTES", 1e18)
+    with pytest.raises(StorageFailed, match=r"at least 1e\+12 MB of free .*, got .*; make room"):
+        Recorder(tmp_path / "new" / "dataset", FPS)
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_killed_process_loses_the_running_episode_and_no_other(tmp_path: Path) -> None:

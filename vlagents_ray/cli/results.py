@@ -135,15 +135,15 @@ def export_command(
     """Write the episodes of an evaluation in a format for other programs, such as CSV or a
     LeRobotDataset.
     """
+    from vlagents_ray.disk import storing
     from vlagents_ray.evaluate import Results
-    from vlagents_ray.evaluate.artifacts.storage import storing
 
     with errors():
         _require_no_dataset(folder)
         export = registered_function("exports", to)
         results = Results.load(folder).only(policy, env)
         parsed = settings_of_export(to, export, settings)
-        with storing(path.parent):
+        with storing(path.parent, "then export again"):
             number = export(results, path, **parsed)
     out.print(f"wrote {number} episodes to {path}")
 

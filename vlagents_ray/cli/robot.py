@@ -7,7 +7,7 @@ The API key of the server is read from the variable VLAGENTS_RAY_API_KEY, and th
 CA from SSL_CERT_FILE.
 
 Exit status: 0 if every tick had an action of the policy, 1 if some had none, 3 if more than half
-had none, 2 if the loop could not run.
+had none, 2 if the loop could not run, or could not record.
 """
 
 from __future__ import annotations
@@ -201,6 +201,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if options.record:
             opened_recorder = Recorder(options.record, hz, interventions=leader is not None)
             recorder = stack.enter_context(opened_recorder)
+            say(recorder.description)
         viewer = None
         if options.rerun is not None:
             viewer = stack.enter_context(open_viewer(options.rerun))

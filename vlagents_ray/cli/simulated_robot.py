@@ -145,6 +145,7 @@ class RobotRun:
             if self.options.record is not None:
                 opened = Recorder(self.options.record, hz, interventions=leader is not None)
                 self.recorder = stack.enter_context(opened)
+                out.print(opened.description)
             if self.options.rerun is not None:
                 self._viewer = stack.enter_context(open_viewer(self.options.rerun))
 

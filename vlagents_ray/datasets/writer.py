@@ -4,7 +4,7 @@ The layout, names and columns are the same as in LeRobot 0.4.4 (`lerobot/dataset
 `lerobot_dataset.py`). LeRobot may put many episodes into a file; here each episode has its own
 files, so that it is either complete or absent. Files receive their final names when they are
 complete, `meta/info.json` last. Files of an episode that `info.json` does not count are removed
-when the dataset is opened again.
+when the dataset is opened again, or when the episode could not be saved.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -97,17 +98,16 @@ class Dataset:
 
         if (root / "meta/info.json").exists():
             self._open(rate)
-        elif root.is_dir() and any(path.name != UNFINISHED_FOLDER for path in root.iterdir()):
+        elif not (root / UNFINISHED_FOLDER).is_dir() and root.is_dir() and any(root.iterdir()):
+            # The folder of running episodes, which is the first file of a dataset, shows that the
+            # first episode was not saved.
             raise ConfigError(
                 f"{root}: not a LeRobotDataset, and not empty; record into a new folder"
             )
 
         # Remove the files of a running or uncounted episode after a crash.
         shutil.rmtree(root / UNFINISHED_FOLDER, ignore_errors=True)
-        uncounted = FILE.format(**_file_numbers(self.episodes))
-        for folder in ("data", "videos/*", "meta/episodes"):
-            for path in root.glob(f"{folder}/{uncounted}.*"):
-                path.unlink()
+        self._remove_uncounted()
 
     @property
     def episodes(self) -> int:
@@ -135,7 +135,31 @@ class Dataset:
         )
 
     def save(self, episode: FinishedEpisode) -> None:
-        """Move the files of an episode into the dataset, and write its rows and metadata."""
+        """Move the files of an episode into the dataset, and write its rows and metadata.
+
+        Raises:
+            OSError: The disk is full, or cannot be written to; the dataset remains without the
+                episode.
+        """
+        try:
+            info, stats = self._write(episode)
+            unfinished_info = self._unfinished_json(info, "meta/info.json")
+        except BaseException:
+            with suppress(OSError):
+                self._remove_uncounted()  # other episodes need the space
+            raise
+
+        self._move(unfinished_info, self.root / "meta/info.json")  # now the episode counts
+        self.info, self._stats = info, stats
+        if episode.folder is not None:
+            shutil.rmtree(episode.folder, ignore_errors=True)
+        with suppress(OSError):  # another episode is running
+            (self.root / UNFINISHED_FOLDER).rmdir()
+
+    def _write(self, episode: FinishedEpisode) -> tuple[dict[str, Any], dict[str, Stats]]:
+        """Move the files of an episode into the dataset, and write its rows; return the info and
+        the statistics of the dataset with this episode.
+        """
         number = self.episodes
         frames = len(episode.rows[ACTION])
         file_numbers = _file_numbers(number)
@@ -192,11 +216,20 @@ class Dataset:
         plain = {}
         for key, statistics in stats.items():
             plain[key] = {name: values.tolist() for name, values in statistics.items()}
-        self._json(plain | episode.about.to_statistics(first + frames), "meta/stats.json")
-        self._json(info, "meta/info.json")
-        self.info, self._stats = info, stats
-        if episode.folder is not None:
-            shutil.rmtree(episode.folder, ignore_errors=True)
+        all_stats = plain | episode.about.to_statistics(first + frames)
+        name = "meta/stats.json"
+        self._move(self._unfinished_json(all_stats, name), self.root / name)
+        return info, stats
+
+    def _remove_uncounted(self) -> None:
+        """Remove the files of an episode that was not saved completely."""
+        uncounted = FILE.format(**_file_numbers(self.episodes))
+        for folder in ("data", "videos/*", "meta/episodes"):
+            for path in self.root.glob(f"{folder}/{uncounted}.*"):
+                path.unlink()
+        for path in (self.root / UNFINISHED_FOLDER).glob("*"):
+            if path.is_file():  # the folders belong to running episodes
+                path.unlink()
 
     def _open(self, fps: float) -> None:
         """Read the metadata of an existing dataset; raise `ConfigError` if it cannot be
@@ -296,11 +329,11 @@ class Dataset:
         self._pq.write_table(table, unfinished, compression="snappy")
         self._move(unfinished, self.root / name)
 
-    def _json(self, value: object, name: str) -> None:
-        """Write a JSON file of the dataset."""
+    def _unfinished_json(self, value: object, name: str) -> Path:
+        """Write a JSON file of the dataset, and return its path before it is complete."""
         unfinished = self._unfinished_file(name)
         unfinished.write_text(json.dumps(value, indent=4, ensure_ascii=False))
-        self._move(unfinished, self.root / name)
+        return unfinished
 
     def _unfinished_file(self, name: str) -> Path:
         """Return the path at which a file is written before it is complete."""

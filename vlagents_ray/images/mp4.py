@@ -55,6 +55,7 @@ class Mp4:
                 larger, and browsers cannot play it.
         """
         self._av: Any = require("av")
+        self._error: OSError | None = None  # the error that ended the video
         self._shape = shape
         height, width = shape[:2]
         # The pixel format yuv420p halves both dimensions, so these must be even.
@@ -93,18 +94,32 @@ class Mp4:
             )
         if any(self._pad):
             image = np.pad(image, ((0, self._pad[0]), (0, self._pad[1]), (0, 0)), mode="edge")
-        frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-        self._container.mux(self._stream.encode(frame))
+        self._write(self._av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24"))
 
     def finish(self) -> None:
         """Write the remaining frames and complete the file."""
-        self._container.mux(self._stream.encode(None))
+        self._write(None)
         self._container.close()
+
+    def _write(self, frame: Any) -> None:
+        """Encode and write a frame; None writes the frames in the encoder.
+
+        Raises:
+            OSError: The disk is full, now or at an earlier frame: FFmpeg crashes if it continues
+                a file whose header was not written.
+        """
+        if self._error is not None:
+            raise self._error
+        try:
+            self._container.mux(self._stream.encode(frame))
+        except OSError as error:  # PyAV raises disk errors as OSErrors
+            self._error = error
+            raise
 
     def abandon(self) -> None:
         """Close the encoder without completing the video.
 
         Errors while writing its end are ignored.
         """
-        with contextlib.suppress(OSError):  # PyAV raises disk errors as OSErrors
+        with contextlib.suppress(OSError):
             self._container.close()

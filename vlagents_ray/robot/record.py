@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import queue
 import threading
@@ -14,11 +15,17 @@ from typing import get_args
 
 import numpy as np
 
-from vlagents_ray.datasets.episode import Label, RunningEpisode
+from vlagents_ray.datasets.episode import ACTION, Label, RunningEpisode
 from vlagents_ray.datasets.writer import Dataset
+from vlagents_ray.disk import require_free, storing
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import CAPTURED, Obs, copied
 
+logger = logging.getLogger(__name__)
+
+# A recording does not begin with less free space, bytes: about a minute of a camera of 640 x 480
+# pixels at 30 Hz.
+LEAST_FREE_BYTES = 50e6
 _NICE = 5  # niceness of the writing thread, so that its priority is lower than the control loop's
 
 
@@ -33,7 +40,7 @@ class Recorder:
     full, the frame is dropped and counted in `dropped`, and the column `tick` shows the gap. An
     episode is part of the dataset as soon as it ends, so a crash loses at most the running episode.
     If writing fails, for instance on a full disk, the episode is lost, and `close` raises the
-    error.
+    error. The robot continues, and later episodes are recorded if there is room again.
 
     Args:
         root: The dataset's folder, which is created or continued.
@@ -44,8 +51,10 @@ class Recorder:
             dataset has these columns, they are always written.
 
     Raises:
-        ConfigError: The folder is not writable, contains other files, or contains a dataset with
-            another rate or version or without these columns.
+        ConfigError: The folder contains other files, or a dataset with another rate or version or
+            without these columns.
+        StorageFailed: The folder cannot be written to, or its disk has less free space than
+            `LEAST_FREE_BYTES`.
         MissingDependency: The extra "record" is not installed.
     """
 
@@ -53,11 +62,15 @@ class Recorder:
         self, root: str | Path, fps: float, *, frames: int = 100, interventions: bool = False
     ) -> None:
         self.dropped = 0
+        self.lost = 0  # the number of frames of episodes that could not be written
         self.error: Exception | None = None  # the first error of writing
+        self._root = Path(root)
         try:
-            self._dataset = Dataset(Path(root), fps, interventions=interventions)
-            # This raises the error of an unusable folder now, not with the first frame.
-            Path(root).mkdir(parents=True, exist_ok=True)
+            with storing(self._root, "then record again"):
+                self.free_bytes = require_free(self._root, LEAST_FREE_BYTES)
+                self._dataset = Dataset(self._root, fps, interventions=interventions)
+                # This raises the error of an unusable folder now, not with the first frame.
+                self._root.mkdir(parents=True, exist_ok=True)
         except (OSError, ValueError, KeyError) as error:
             # The folder does not exist, is not accessible, or has damaged files.
             raise ConfigError(
@@ -88,6 +101,11 @@ class Recorder:
     def interventions(self) -> bool:
         """Whether the frames have the columns of interventions."""
         return self._dataset.interventions
+
+    @property
+    def description(self) -> str:
+        """The folder and the free space at the beginning, for the operator."""
+        return f"records into {self._root}, whose disk has {self.free_bytes / 1e9:.1f} GB free"
 
     @contextlib.contextmanager
     def episode(self, instruction: str) -> Iterator[None]:
@@ -157,24 +175,40 @@ class Recorder:
         def write(episode: RunningEpisode | None) -> RunningEpisode | None:
             """Add the frame to the running episode."""
             self._taken += 1
-            if episode is not None:  # None: it was abandoned after an error
+            if episode is None:  # it was abandoned after an error
+                self.lost += 1
+            else:
                 captured_at = float(obs_copy.info[CAPTURED])
-                episode.add(
-                    obs_copy, action_copy, captured_at, tick, safe, intervention, policy_action
-                )
+                try:
+                    episode.add(
+                        obs_copy, action_copy, captured_at, tick, safe, intervention, policy_action
+                    )
+                except Exception:
+                    self.lost += 1
+                    raise
             return episode
 
         self._added += 1
         self._queue.put(write)
 
     def close(self) -> None:
-        """Write the frames in the queue, and raise the first error that occurred."""
+        """Write the frames in the queue, and raise the first error that occurred.
+
+        Raises:
+            StorageFailed: The disk is full, or cannot be written to.
+            InvalidObservation: The cameras or shapes of an episode differ.
+        """
         if self._thread.is_alive():
             self._queue.put(None)
             self._thread.join()
         if self.error is not None:
             error, self.error = self.error, None
-            raise error
+            kept = (
+                f"complete episodes kept: {self.episodes}, frames of others lost: {self.lost}; "
+                "then continue in this folder"
+            )
+            with storing(self._root, kept):
+                raise error
 
     def __enter__(self) -> Recorder:
         return self
@@ -198,7 +232,9 @@ class Recorder:
                 episode = step(episode)
             except Exception as error:  # noqa: BLE001 - raised by `close`; the robot continues
                 self.error = self.error or error
+                logger.warning("an episode is not recorded, but the robot continues: %s", error)
                 if episode is not None:
+                    self.lost += len(episode.rows.get(ACTION, ()))
                     episode.abandon()
                 episode = None
 

@@ -78,11 +78,11 @@ def test_pictures_go_to_those_who_show_them(own: ReplicaView) -> None:
 
 def test_a_command_reaches_the_replica_that_has_the_session(own: ReplicaView) -> None:
     gathered = Fleet(own, Others("b"))
-    assert asyncio.run(gathered.press("of b", "stop", "lab", None)) == {"do": "stop", "by": "lab"}
+    assert asyncio.run(gathered.press("of b", "stop", "lab")) == {"do": "stop", "by": "lab"}
     with pytest.raises(UnknownSession):
-        asyncio.run(gathered.press("of c", "stop", "lab", None))
+        asyncio.run(gathered.press("of c", "stop", "lab"))
     with pytest.raises(UnknownSession):
-        asyncio.run(Fleet(own).press("of b", "stop", "lab", None))
+        asyncio.run(Fleet(own).press("of b", "stop", "lab"))
 
 
 def test_a_replica_that_does_not_answer_is_left_out_and_asked_again_from_where_it_was(

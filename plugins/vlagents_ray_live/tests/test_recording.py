@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from eval_fakes import wait_for
+from faulty_disks import FULL, python_on
 from recorded_sessions import Brightness, recorded, reply_of, seen
 
 from vlagents_ray.datasets.writer import Dataset
@@ -300,6 +301,52 @@ def test_a_full_disk_ends_the_recording_and_no_session(
         wait_for(lambda: server.recorder.ended is not None)
         assert robot.act(seen(2)).shape == (4, 2)
         assert server.recorder.lost >= 2 or not full
+
+
+RECORD_AT_EACH_WRITE = """
+import json, logging, sys
+from pathlib import Path
+from faulty_disks import at_each_write
+from recorded_sessions import recorded
+from vlagents_ray.errors import ConfigError, StorageFailed
+from vlagents_ray_live import episodes
+episodes._FREE_BYTES = 0
+
+class Messages(logging.Handler):
+    def emit(self, record):
+        messages.append(record.getMessage())
+
+messages = []
+logging.getLogger("vlagents_ray_live").addHandler(Messages())
+
+def write(root):
+    messages.clear()
+    try:
+        with recorded(root, pictures="small") as server:
+            robot = server.robot()
+            robot.play(3, seed=1)
+            robot.play(3, seed=2)
+    except ConfigError as error:
+        raise StorageFailed(str(error)) from error
+    if messages:
+        raise StorageFailed(messages[0])
+    assert server.recorder.lost == 0
+
+def check(root):
+    infos = [json.loads(path.read_text()) for path in root.glob("*/meta/info.json")]
+    assert sum(info["total_episodes"] for info in infos) >= 2, infos
+
+print("failed writes:", at_each_write(Path(sys.argv[1]), write, check))
+"""
+
+
+@pytest.mark.hosts
+def test_a_disk_that_fills_at_any_write_ends_the_recording_with_one_sentence(
+    tmp_path: Path,
+) -> None:
+    done = python_on(FULL, tmp_path, RECORD_AT_EACH_WRITE, size="4m,nr_inodes=400")
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.splitlines()[-1].removeprefix("failed writes: ")) > 20
 
 
 def test_a_folder_that_cannot_be_written_to_is_told_at_the_start(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def test_a_command_reaches_the_replica_that_has_the_session(
     replicas = [Answering(str(number), answer) for number, answer in enumerate(answers)]
     assert asyncio.run(views_of(*replicas).press("arm", "stop", "lab")) == pressed
     for replica in replicas:
-        assert replica.calls == [("live", "press", "arm", "stop", "lab", METHODS["press"])]
+        assert replica.calls == [("live", "press", "arm", "stop", "lab", None, METHODS["press"])]
 
 
 def test_the_refusal_of_a_command_is_raised() -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -18,6 +18,7 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.dataset_contract import CHUNK, ROWS, SESSION, TRACE
 from vlagents_ray.datasets.episode import RunningEpisode
 from vlagents_ray.datasets.writer import Dataset
+from vlagents_ray.disk import require_free, storing
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Obs
 
@@ -29,14 +30,15 @@ _FRAMES = 2000
 _BYTES = 16 * 2**20  # maximum size of the numbers of an episode, bytes
 # Maximum number of sessions that are recorded at the same time; each has an encoder per camera.
 _SESSIONS = 32
-_FREE_BYTES = 2**30  # the space that the recording leaves free on its disk, bytes
+_FREE_BYTES = 1e9  # the space that the recording leaves free on its disk, bytes
+KEPT = "the saved episodes are kept; restart the server to record again"  # after a disk error
 _CHECK_S = 10.0  # the interval of the checks of the folder's size
 # The keys of the metadata that a trace contains.
 _TRACE_KEYS = ("policy", "checkpoint", "weights", "policy_version", "contract", "version", "code")
 
 
 class RecordingEnded(Exception):
-    """Recording has ended because its folder or its disk is full."""
+    """Recording has ended because its folder is full."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +117,7 @@ class EpisodeWriter:
     ) -> None:
         self.saved = 0  # the number of frames in complete episodes
         self.lost = 0  # the number of frames in episodes that could not be written
-        self._folder = folder
+        self.folder = folder
         self._name = name
         self._fps = fps
         self._lossless = lossless
@@ -150,7 +152,8 @@ class EpisodeWriter:
         """Append a frame to a session that is being recorded.
 
         Raises:
-            RecordingEnded: The folder, or its disk, is full; the recorded episodes are complete.
+            RecordingEnded: The folder is full; the recorded episodes are complete.
+            StorageFailed: The disk is full; the recorded episodes are complete.
             OSError: The frame cannot be written.
         """
         recorded = self._recorded[session]
@@ -203,29 +206,28 @@ class EpisodeWriter:
         """End all episodes; drop those that cannot be written."""
         for session in list(self._recorded):
             try:
-                self.end(session)
+                with storing(self.folder, KEPT):
+                    self.end(session)
             except (OSError, VLAgentsError) as error:
                 logger.warning(
                     "recording: the last episode of session %s is lost: %s", session, error
                 )
 
     def require_room(self) -> None:
-        """Raise `RecordingEnded` if the folder, or its disk, is full."""
+        """Raise `RecordingEnded` if the folder is full, and `StorageFailed` if its disk is."""
         self._checked_at = time.monotonic()
-        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         size = 0
-        for root, _, names in os.walk(self._folder):
+        for root, _, names in os.walk(self.folder):
             for name in names:
                 with suppress(OSError):  # the file has just been renamed
                     size += os.stat(os.path.join(root, name)).st_size
         if size > self._most_bytes:
             raise RecordingEnded(
-                f"{self._folder}: expected at most {self._most_bytes / 1e9:g} GB, got "
+                f"{self.folder}: expected at most {self._most_bytes / 1e9:g} GB, got "
                 f"{size / 1e9:.3g}"
             )
-        free = shutil.disk_usage(self._folder).free
-        if free < _FREE_BYTES:
-            raise RecordingEnded(f"the disk of {self._folder} has {free / 1e9:.1f} GB left")
+        require_free(self.folder, _FREE_BYTES)
 
     def _save(self, recorded: _RecordedSession) -> Path | None:
         """Complete the current episode of a session, and return the folder of its dataset; None if
@@ -256,8 +258,11 @@ class EpisodeWriter:
             if target.fits(frame):
                 return target
 
-        root = self._folder / f"{self._name}-{len(self._targets)}"
-        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # A server that was restarted within a second has the same name.
+        numbers = itertools.count(len(self._targets))
+        roots = (self.folder / f"{self._name}-{number}" for number in numbers)
+        root = next(root for root in roots if not root.exists())
+        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         root.mkdir(mode=0o700)  # other users must not read the pictures
         dataset = Dataset(root, self._fps, lossless=self._lossless)
 

@@ -107,7 +107,9 @@ class ReplicaView:
         each_half_second.remove(self.live.expire)
         self.live.close()
 
-    def press(self, session: str, do: str, by: str, episode: str | None) -> dict[str, Any] | None:
+    def press(
+        self, session: str, do: str, by: str, episode: str | None = None
+    ) -> dict[str, Any] | None:
         """Give a command to a session, and wait for its outcome for a limited time.
 
         Args:
@@ -328,7 +330,7 @@ class OtherReplicas(Protocol):
         """Return the readers of the replicas' snapshots, by name."""
 
     async def press(
-        self, session: str, do: str, by: str, episode: str | None
+        self, session: str, do: str, by: str, episode: str | None = None
     ) -> dict[str, Any] | None:
         """Give a command to a session, see `CommandBoard.press`; return None if no replica has
         the session.
@@ -430,7 +432,9 @@ class Fleet:
                 self._gathering.cancel()
                 self._gathering = None
 
-    async def press(self, session: str, do: str, by: str, episode: str | None) -> dict[str, Any]:
+    async def press(
+        self, session: str, do: str, by: str, episode: str | None = None
+    ) -> dict[str, Any]:
         """Give a command to a session of any replica.
 
         Args:

@@ -29,7 +29,8 @@ from typing import Any, Literal
 from pydantic import Field
 from ray.util.metrics import Counter, Gauge
 
-from vlagents_ray.errors import ConfigError, PolicyFailed, UnknownSession
+from vlagents_ray.disk import storing
+from vlagents_ray.errors import ConfigError, PolicyFailed, StorageFailed, UnknownSession
 from vlagents_ray.interface import CAPTURED, POLICY, Obs, copied
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.protocol.values import to_text
@@ -44,7 +45,7 @@ from vlagents_ray.serve.replica.metrics import PERIOD_S, series
 from vlagents_ray.serve.replica.part import ReplicaPart
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import SessionTable
-from vlagents_ray_live.episodes import EpisodeWriter, RecordedAct, RecordingEnded
+from vlagents_ray_live.episodes import KEPT, EpisodeWriter, RecordedAct, RecordingEnded
 
 logger = logging.getLogger(__name__)
 
@@ -349,8 +350,9 @@ class SessionRecorder(Observer):
         if self.ended is not None:
             return
         try:
-            write()
-        except (OSError, RecordingEnded) as error:
+            with storing(self._writer.folder, KEPT):
+                write()
+        except (OSError, StorageFailed, RecordingEnded) as error:
             self.ended = str(error)
             logger.error("recording has ended, but the sessions continue: %s", error)  # noqa: TRY400 - the message contains the reason
             self._writer.close()
@@ -379,7 +381,7 @@ class SessionRecorder(Observer):
                 else:  # too many sessions are recorded
                     self.dropped += 1
 
-        except (OSError, RecordingEnded):
+        except (OSError, StorageFailed, RecordingEnded):
             raise
         except UnknownSession:  # the session has ended, and with it its episode
             self.dropped += 1
@@ -441,12 +443,11 @@ def open_recorder(
 
     folder = Path(args.folder)
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise ConfigError(
-            f"parts.record.folder: {folder} cannot be written to ({error})"
-        ) from error
+        with storing(folder, "then start the server again"):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+    except (OSError, StorageFailed) as error:
+        raise ConfigError(f"parts.record.folder: cannot be written to: {error}") from error
 
     begun_at = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
     replica_name = re.sub(r"[^A-Za-z0-9]+", "-", replica.removeprefix("SERVE_REPLICA::"))

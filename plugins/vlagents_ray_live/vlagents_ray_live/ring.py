@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from vlagents_ray.dataset_contract import GRIPPER
+from vlagents_ray.disk import storing
 from vlagents_ray.errors import InvalidInput, Overloaded, StorageFailed
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Obs
@@ -163,7 +164,7 @@ class Ring:
         Raises:
             InvalidInput: No frame of the session is kept.
             Overloaded: Another session is being saved.
-            StorageFailed: The folder is full.
+            StorageFailed: The folder or its disk is full, or cannot be written to.
         """
         if not self._saving.acquire(blocking=False):
             raise Overloaded("save: another session is being saved; press again when it is saved")
@@ -184,10 +185,11 @@ class Ring:
                     instruction = candidate.instruction
                     break
 
-            self._writer.begin(session, instruction)
-            while frames:
-                self._writer.add(session, _recorded(frames.popleft()))
-            return str(self._writer.end(session))
+            with storing(self._writer.folder, "the saved episodes are kept; press again"):
+                self._writer.begin(session, instruction)
+                while frames:
+                    self._writer.add(session, _recorded(frames.popleft()))
+                return str(self._writer.end(session))
         except RecordingEnded as error:
             raise StorageFailed(f"parts.live.folder: {error}; make room there") from error
         finally:

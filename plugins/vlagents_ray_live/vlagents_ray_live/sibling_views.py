@@ -47,7 +47,7 @@ class SiblingViews(OtherReplicas):
         return self._views
 
     async def press(
-        self, session: str, do: str, by: str, episode: str | None
+        self, session: str, do: str, by: str, episode: str | None = None
     ) -> dict[str, Any] | None:
         """Give a command to a session, see `CommandBoard.press`.
 

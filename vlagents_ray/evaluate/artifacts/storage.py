@@ -2,52 +2,24 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import platform
 import shutil
-import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from glob import escape
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, StorageFailed
+from vlagents_ray import disk
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.ray_tools.git_state import GitState, code_in, code_of
 from vlagents_ray.registry import target_of
 
 VIDEOS, TRAJECTORIES, PROVENANCE = "videos", "trajectories", "provenance"
 _RESUME = "finished episodes are kept: continue with --resume"
-_FULL = f"make room; {_RESUME}"
-_WRITABLE = "make it writable, or choose another folder"
-_CURES = {
-    errno.ENOSPC: ("the disk is full", _FULL),
-    errno.EDQUOT: ("your quota on this disk is used up", _FULL),
-    errno.EFBIG: (
-        "a file would be larger than is allowed here (ulimit -f)",
-        f"allow more; {_RESUME}",
-    ),
-    errno.EROFS: ("is on a read-only file system", _WRITABLE),
-    errno.EACCES: ("you may not write there", _WRITABLE),
-    errno.EPERM: ("you may not write there", _WRITABLE),
-    errno.ENOTDIR: ("a part of the path is not a folder", "choose another folder"),
-    errno.EEXIST: ("exists and is not a folder", "choose another folder"),
-    errno.EIO: (
-        "the disk reports an error",
-        f"see the system's log (dmesg), and repair the disk; {_RESUME}",
-    ),
-    errno.ESTALE: ("the file server has lost the folder", f"mount it again; {_RESUME}"),
-}
-# SQLite reports these texts instead of the system's errno.
-_SQLITE = {
-    "database or disk is full": errno.ENOSPC,
-    "attempt to write a readonly database": errno.EROFS,
-    "unable to open database file": errno.EACCES,
-    "disk I/O error": errno.EIO,
-}
 
 
 def require_below(path: str) -> str:
@@ -162,27 +134,11 @@ def link_or_copy(source: Path, target: Path) -> None:
             shutil.copyfile(source, unfinished_path)
 
 
-@contextmanager
-def storing(folder: Path) -> Iterator[None]:
-    """Return a context manager that replaces disk errors in `folder` with `StorageFailed`, whose
-    message contains the cause and the cure. Other errors are unchanged.
-
-    Use the context only around code in which every `OSError` is a disk error.
+def storing(folder: Path) -> AbstractContextManager[None]:
+    """Return a context manager that replaces disk errors in a folder of results with
+    `StorageFailed`; see `vlagents_ray.disk.storing`.
     """
-    try:
-        yield
-    except (OSError, sqlite3.OperationalError) as error:
-        number = error.errno if isinstance(error, OSError) else _SQLITE.get(str(error))
-        if isinstance(error, sqlite3.OperationalError) and number == errno.EACCES:
-            folders = (folder, *folder.absolute().parents)
-            disk = os.statvfs(next(path for path in folders if path.exists()))
-            if disk.f_flag & os.ST_RDONLY:
-                number = errno.EROFS
-
-        if number not in _CURES:
-            raise
-        cause, cure = _CURES[number]
-        raise StorageFailed(f"{folder}: {cause} ({error}); {cure}") from error
+    return disk.storing(folder, _RESUME)
 
 
 def driver_code() -> dict[str, GitState | None]:
