@@ -776,14 +776,16 @@ ARM = ["--robot", SIMULATED]
         (["--silent-s", "inf"], "--silent-s: expected a number of at most .*, got 'inf'"),
         (["--timeout-s", "1e300"], "expected a number of at most"),
         (["--execute", "99999999999"], "expected a number of at most"),
-        (["--record", "/proc/x"], "recorder /proc/x: .*record into a new folder"),
-        (["--record", "{file}"], "recorder .*record into a new folder"),
-        (["--record", "{file}/below"], "recorder .*record into a new folder"),
+        (["--record", "/proc/x"], "/proc/x: expected at least 50 MB of free .*; make room"),
+        (["--record", "{file}"], "{file}: exists and is not a folder .*; choose another folder"),
+        (["--record", "{file}/below"], "a part of the path is not a folder .*; choose another"),
+        (["--record", "{folder}"], "not a LeRobotDataset, and not empty; record into a new folder"),
         (["--record", "{damaged}"], "recorder .*record into a new folder"),
         (["--rerun", "{file}"], "{file}|rerun"),
-        (["--limits", "{file}"], "{file}|limits"),
-        (["--limits", "{folder}"], "limits"),
-        (["--limits", "/nowhere.yaml"], "nowhere"),
+        (["--limits", "{file}"], "limits {file}: "),
+        (["--limits", "{folder}"], "LeRobotDataset v3.0, got no file {folder}/meta/info.json; see"),
+        (["--limits", "/nowhere.yaml"], "a LeRobotDataset v3.0, got no file /nowhere.yaml; see"),
+        (["--limits", "{limits}"], "limits {limits}: expected only .*; did you mean 'velocity'"),
         (["--stats", "{folder}", *ARM], "statistics"),
         (["--robot", "ros:{folder}"], "cannot be read as a file of ROS topics"),
         (["--robot", "ros:/nowhere.yaml"], "cannot be read as a file of ROS topics"),
@@ -829,10 +831,12 @@ def test_each_wrong_argument_is_an_error_with_its_cure(
     (modules / "raising_module.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(str(modules))
     (tmp_path / "file").write_text("a file")
+    (tmp_path / "limits.yaml").write_text("velocty: 3")
     (tmp_path / "damaged/meta").mkdir(parents=True)
     (tmp_path / "damaged/meta/info.json").write_text("{")
     places = {name: str(tmp_path / name) for name in ("file", "damaged")} | {
         "folder": str(tmp_path),
+        "limits": str(tmp_path / "limits.yaml"),
         "here": HERE,
     }
     given = [word.format(**places) for word in words]
@@ -843,3 +847,12 @@ def test_each_wrong_argument_is_an_error_with_its_cure(
     error = capsys.readouterr().err
     assert status == 2, error
     assert re.search(said.format(**places), error, re.DOTALL), error
+    require_said_once(error)
+
+
+def require_said_once(error: str) -> None:
+    """Fail if a message contains our own errors within others, or a part twice."""
+    assert len(re.findall(r"(?:ConfigError|StorageFailed|InvalidInput): ", error)) <= 1, error
+    parts = [part.strip() for part in re.split(r"[;\n]", error) if part.strip()]
+    for part, other in itertools.permutations(parts, 2):
+        assert part not in other, (part, error)

@@ -31,6 +31,7 @@ MARGIN = 2.0
 """The ratio of the limits to the quantiles of a dataset. The soft start begins at half of the
 limits, i.e. at the quantiles.
 """
+_ACCEPTED = "a .yaml or .json file of limits, a .urdf, or the folder of a LeRobotDataset v3.0"
 _PER_RAD = {"rad": 1.0, "deg": 180 / math.pi}
 _TOLERANCE = 0.1  # share of the demonstrated range by which an action may exceed the range
 
@@ -111,6 +112,13 @@ class MotionLimits:
             if path.suffix == ".urdf":
                 return cls._from_urdf(path, joints=(), tip=None, scale=1.0)
             return cls._from_document(path, _document(path))
+        except ConfigError as error:
+            raise ConfigError(f"limits {path}: {error}") from error
+        except FileNotFoundError as error:
+            raise ConfigError(
+                f"limits {path}: expected {_ACCEPTED}, got no file {error.filename}; see "
+                "docs/guard.md"
+            ) from error
         except (
             OSError,
             ValueError,
@@ -121,8 +129,7 @@ class MotionLimits:
             ET.ParseError,
         ) as error:
             raise ConfigError(
-                f"limits {path}: expected a .yaml or .json file of limits, a .urdf, or a "
-                f"LeRobotDataset v3.0, got {type(error).__name__}: {error}; see "
+                f"limits {path}: expected {_ACCEPTED}, got {type(error).__name__}: {error}; see "
                 "docs/guard.md"
             ) from error
 

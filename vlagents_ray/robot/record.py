@@ -71,6 +71,8 @@ class Recorder:
                 self._dataset = Dataset(self._root, fps, interventions=interventions)
                 # This raises the error of an unusable folder now, not with the first frame.
                 self._root.mkdir(parents=True, exist_ok=True)
+        except ConfigError:
+            raise
         except (OSError, ValueError, KeyError) as error:
             # The folder does not exist, is not accessible, or has damaged files.
             raise ConfigError(

@@ -135,3 +135,40 @@ def test_an_apply_that_blocks_is_reported_by_the_loop(
         report = run_loop(Waiting(), Still(), hz=hz, seconds=0.4)
     assert (report.blocking is not None) == blocks
     assert ("without waiting for the arm to arrive" in caplog.text) == blocks
+
+
+RANGES = {"rad": 3.1, "deg": 180.0, "%": 100.0}  # of a joint
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.03, 0.3, 0.9])
+@pytest.mark.parametrize("true_unit", RANGES)
+@pytest.mark.parametrize("unit", RANGES)
+def test_units_are_checked_only_where_joints_are_not_near_zero(
+    unit: str, true_unit: str, share: float
+) -> None:
+    """An arm with three joints stands at a share of their range, and reads in another unit than it
+    declares, or in the same.
+    """
+    joints = np.array([0.0, -0.5, 1.0], np.float32) * np.float32(share * RANGES[true_unit])
+
+    class Standing(Own):
+        contract = Contract(
+            state={"joints": StateSpec(3, unit)},
+            action=ActionSpec(dim=3, space="joint", delta=False),
+        )
+
+        def observe(self) -> Obs:
+            return Obs({"front": self.picture()}, state={"joints": joints.copy()})
+
+    report = examine(Standing())
+    is_found = any(finding.check == "units" for finding in report.findings)
+    if "rad" in (unit, true_unit) and unit != true_unit:
+        assert "units" not in report.passed or unit == "rad"
+    if unit == "rad" and true_unit == "deg":
+        # Degrees below a turn of radians are found only if they are not near zero.
+        assert is_found == (share >= 0.3)
+    if unit == true_unit:
+        assert not is_found
+        assert ("units" in report.passed) == (share >= 0.3 or (unit == "rad" and share >= 0.04))
+    if share == 0.0:
+        assert "all joints are near 0" in report.skipped["units"]
