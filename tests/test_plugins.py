@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -88,11 +89,28 @@ def test_a_plugins_entry_carries_what_a_built_in_one_does(install: Install) -> N
     assert (listed.kind, listed.what, listed.missing) == ("policy", "models of the lab", None)
 
 
-def test_a_built_in_name_is_not_replaced(install: Install) -> None:
+def test_a_built_in_name_is_not_replaced(
+    install: Install, caplog: pytest.LogCaptureFixture
+) -> None:
     install("lab-policies", policies="noop = lab_policies.registry:MINE")
     entry = find_entry("policies", "noop")
     assert entry is not None
     assert entry.distribution == registry.CORE
+    names("policies")
+    assert "lab-policies registers 'noop', a name of vlagents-ray" in caplog.text
+
+
+def test_a_built_in_command_is_not_replaced(
+    install: Install, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "lab_policies" / "command.py").write_text("def run(): raise SystemExit(7)\n")
+    with (tmp_path / "lab_policies" / "registry.py").open("a") as file:
+        file.write("COMMAND = RegistryEntry('lab_policies.command:run')\n")
+    install("lab-policies", commands="keys = lab_policies.registry:COMMAND")
+    command = [sys.executable, "-m", "vlagents_ray", "keys"]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(tmp_path)}, check=False)
+    assert done.returncode != 7
+    assert "lab-policies registers 'keys', a name of vlagents-ray" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

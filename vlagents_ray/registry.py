@@ -453,20 +453,35 @@ def _is_installed(entry: RegistryEntry) -> bool:
 def _entry_points(kind: str) -> Mapping[str, tuple[EntryPoint, ...]]:
     if kind not in _GROUPS:
         return {}
-    return _installed_entry_points(f"vlagents_ray.{kind}", tuple(sys.path))
+    return _installed_entry_points(kind, tuple(sys.path))
 
 
 @functools.cache
 def _installed_entry_points(
-    group: str, _path: tuple[str, ...]
+    kind: str, _path: tuple[str, ...]
 ) -> Mapping[str, tuple[EntryPoint, ...]]:
-    """Return the entry points of a group that are on `path`, from a cache, since reading the entry
+    """Return the entry points of a kind that are on `path`, from a cache, since reading the entry
     points of all installed packages takes 20 ms.
     """
     by_name: dict[str, tuple[EntryPoint, ...]] = {}
-    for point in entry_points(group=group):
+    for point in entry_points(group=f"vlagents_ray.{kind}"):
         by_name[point.name] = (*by_name.get(point.name, ()), point)
+    for name in by_name.keys() & _BUILT_IN[kind].keys():
+        logger.warning("%s", _taken(by_name[name]))
     return MappingProxyType(by_name)
+
+
+def name_is_taken(kind: str, name: str) -> str:
+    """Return the message about a plug-in's name that is ignored, as this package has the name."""
+    return _taken(_entry_points(kind)[name])
+
+
+def _taken(points: tuple[EntryPoint, ...]) -> str:
+    point = points[0]
+    return (
+        f"{point.group}: {_distribution_of(point)} registers {point.name!r}, a name of "
+        f"{CORE}, which cannot be replaced; register another name"
+    )
 
 
 @functools.cache

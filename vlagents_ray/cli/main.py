@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -22,10 +23,19 @@ from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.typer_help import use_help_pages
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.naming import did_you_mean
-from vlagents_ray.registry import find_entry, names, not_installed, pip_install, registered_function
+from vlagents_ray.registry import (
+    find_entry,
+    name_is_taken,
+    names,
+    not_installed,
+    pip_install,
+    registered_function,
+)
 
 if TYPE_CHECKING:
     from vlagents_ray.cli.listing import Listed
+
+logger = logging.getLogger(__name__)
 
 OneName = Annotated[
     str | None, typer.Argument(metavar="[NAME]", help="Show the details of this name alone.")
@@ -179,10 +189,14 @@ for _commands, _name, _short_help in (
 
 def _add_commands_of_plugins() -> None:
     """Add the commands of installed plug-ins; a command that cannot be imported fails when it is
-    called.
+    called. A command of this package is not replaced.
     """
+    own = set(typer.main.get_group(app).commands)
     for name in names("commands"):
         if "." in name:  # a subcommand, which `cli.robot` runs
+            continue
+        if name in own:
+            logger.warning("%s", name_is_taken("commands", name))
             continue
         try:
             command = registered_function("commands", name)

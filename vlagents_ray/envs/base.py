@@ -361,13 +361,18 @@ def one_row(act: Act, contract: Contract) -> np.ndarray:
     """Return the action of a step, (D,) float32.
 
     Raises:
-        InvalidAction: The action is a chunk, or not valid.
+        InvalidAction: There is no Act, its action is a chunk, or it is not valid.
     """
+    if not isinstance(act, Act):
+        raise InvalidAction(
+            f"action: expected an Act, got {type(act).__name__}; pass env.step(Act(row))"
+        )
     action = check_action(act.action, contract)
     if action.ndim != 1:
         dim = contract.action.dim
         raise InvalidAction(
-            f"action: expected shape ({dim},), got {action.shape}; step through a chunk row by row"
+            f"action: expected shape ({dim},), got {action.shape}; step through a chunk row by row "
+            "with `for row in act.rows(): env.step(Act(row))`"
         )
     return action
 

@@ -139,6 +139,26 @@ class Failing(Agent):
         raise RuntimeError("secret")
 
 
+ORDER = "[...document.querySelectorAll('article')].map((one) => one.dataset.session)"
+
+
+def test_cards_keep_their_places_as_each_has_a_stop_button(page: Page, server: LiveServer) -> None:
+    wait_for(lambda: len(server.engine.sessions) == 0, 30)
+    with acting(server, 3):
+        show(page, server)
+        until(page, CARDS, 3)
+        order = page.value(ORDER)
+        assert order == sorted(order)
+        show(page, server)
+        until(page, CARDS, 3)
+        assert page.value(ORDER) == order
+
+    # The cards of sessions that have ended stay where they are for a while, without buttons.
+    until(page, "document.querySelectorAll('article.silent').length", 3)
+    assert page.value(ORDER) == order
+    until(page, CARDS, 0)
+
+
 def test_an_error_is_its_code_until_it_is_unfolded(page: Page) -> None:
     error = "document.querySelector('article .bad')"
     with live_server(Failing()) as server, RemoteAgent(server.url) as agent:

@@ -626,7 +626,10 @@ def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
             f"{KEY_VARIABLE}"
         )
     if status == 404:
-        return UnknownApp(f"no application at this path ({text}); check the URL")
+        return UnknownApp(
+            f"no application at this path ({text}); the URL ends in the route prefix of an "
+            "application, such as http://HOST:8000/NAME; the server prints it when it starts"
+        )
     if status in (500, 502, 503, 504):  # the proxy answered, since no replica is ready
         return NoReplica(f"no replica answers (HTTP {status}: {text})")
     return VLAgentsError(f"HTTP {status}: {text}")

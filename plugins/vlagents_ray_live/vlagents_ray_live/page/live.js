@@ -3,6 +3,7 @@
 
 const KEPT_S = 10; // times and rates are of the last seconds
 const POINTS = 120; // of a sparkline
+const LINGER_S = 10; // for which the card of a session that has ended stays
 const LINES = 8; // most lines in one plot
 const STAGES = ["decode", "queue", "inference", "encode"];
 const COLOURS = ["--c0", "--c1", "--c2", "--c3", "--c4", "--c5"];
@@ -105,7 +106,7 @@ function show(said, files) {
       try {
         present.add(session.id);
         if (!cards.has(session.id)) cards.set(session.id, new Card(session.id));
-        cards.get(session.id).update(session, files, replica.ring_s);
+        cards.get(session.id).update(session, files, replica.ring_s, said.time);
       } catch (error) {
         failed = error;
         cards.get(session?.id)?.remove(); // the next message makes another
@@ -115,7 +116,14 @@ function show(said, files) {
   }
   const names = new Set(said.replicas.map((one) => one.name));
   for (const [name, one] of replicas) if (!names.has(name) && said.time - one.time > 3) replicas.delete(name);
-  for (const [id, card] of cards) if (!present.has(id) && ++card.missed > 5) { card.remove(); cards.delete(id); }
+  for (const [id, card] of cards) {
+    if (present.has(id)) continue;
+    card.end();
+    if (said.time - card.seen > LINGER_S) {
+      card.remove();
+      cards.delete(id);
+    }
+  }
   if (said.evaluation) showEvaluation(said.evaluation, said.time);
   for (const section of document.querySelectorAll(".of-server")) section.hidden = evaluation !== null && !replicas.size;
   showFleet(said.time);
@@ -224,7 +232,7 @@ function polyline(points, colour) {
 class Card {
   constructor(id) {
     this.id = id;
-    this.missed = 0;
+    this.seen = 0; // time of the newest message about the session, s
     this.values = { step: null, "ticks in time": null, "age p95": null, server: null, "batch of": null, "weights version": null, "last request": null };
     this.series = new Map(); // by part of the state: its last rows
     this.plots = new Map(); // by name
@@ -245,16 +253,29 @@ class Card {
     this.instruction.id = `session-${unique}`;
     this.root.setAttribute("aria-labelledby", `session-${unique} name-${unique}`);
     this.filter();
-    byId("sessions").append(this.root);
+    this.place(byId("sessions"));
   }
 
-  update(said, files, ring) {
-    this.missed = 0;
+  // Cards are in the order of their sessions: a Stop button must be where it was at the last look.
+  place(container) {
+    this.root.dataset.session = this.id;
+    const next = [...container.children].find((other) => other.dataset.session > this.id);
+    container.insertBefore(this.root, next ?? null);
+  }
+
+  // The card keeps its place for a while after its session, so that no other card moves under the pointer.
+  end() {
+    this.root.classList.add("silent");
+    this.operated.hidden = true;
+  }
+
+  update(said, files, ring, time) {
+    this.seen = time;
     if (said.priority && said.priority !== this.priority) {
       this.priority = said.priority;
       this.name.replaceChildren(this.name.firstChild, `, ${said.priority}, ${said.transport}`);
       this.numbers.open = said.priority === "robot";
-      byId(said.priority === "robot" ? "sessions" : "simulations").append(this.root);
+      this.place(byId(said.priority === "robot" ? "sessions" : "simulations"));
     }
     this.instruction.textContent = said.instruction ? `“${said.instruction}”` : "No instruction";
     this.filter();
