@@ -356,7 +356,9 @@ def test_a_rotation_may_be_beside_joints() -> None:
 
 def test_the_opening_of_a_gripper_is_between_the_ends_of_either_contract() -> None:
     spec = ActionSpec(delta=False, gripper_open=1.0)
-    assert Columns.from_spec(spec, 2).gripper_command(1.0) is None
+    assert Columns.from_spec(spec, 2).gripper_command(1.0) == 1.0
+    for unknown in (0.0, 0.9):
+        assert Columns.from_spec(spec, 2).gripper_command(unknown) is None
     columns = Columns.from_spec(spec, 2, ActionSpec(gripper_open=5.0, gripper_closed=-1.0))
     assert columns.gripper_command(0.25) == -0.5
 

@@ -121,10 +121,31 @@ class Columns:
                 row[rotation.start : rotation.stop] = _IDENTITIES[rotation.kind]
         return row
 
+    def first_still(self, opening: float | None) -> np.ndarray | None:
+        """Return a row without motion before any command, (D,) float32.
+
+        Args:
+            opening: The opening of the grippers in [0, 1], where 1 is open; None if it is unknown.
+
+        Returns:
+            The row; None if a target is unknown.
+        """
+        if len(self.absolute) > len(self.grippers):
+            return None
+        row = self.still()
+        if self.grippers:
+            command = None if opening is None else self.gripper_command(opening)
+            if command is None:
+                return None
+            row[list(self.grippers)] = command
+        return row
+
     def gripper_command(self, opening: float) -> float | None:
         """Return the command for an opening of a gripper in [0, 1], where 1 is open; None if the
-        contracts do not declare the values of both ends.
+        contracts do not declare the values that it needs.
         """
+        if opening in (0.0, 1.0):
+            return self.gripper_open if opening else self.gripper_closed
         if self.gripper_open is None or self.gripper_closed is None:
             return None
         return self.gripper_closed + opening * (self.gripper_open - self.gripper_closed)
@@ -159,6 +180,18 @@ class Columns:
                 row[part] = _between(rotation.kind, start[part].tolist(), goal_numbers, end)
         return row
 
+    def nearest(self, row: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Return a row with the representations of its rotations that are nearest to another row,
+        (D,) float32: a roll of pi and a roll of -pi are the same rotation.
+        """
+        same = np.array(row, np.float32)
+        for rotation in self.rotations:
+            if not rotation.is_relative:
+                part = slice(rotation.start, rotation.stop)
+                quaternion = _read(rotation.kind, row[part].tolist())
+                same[part] = _write(rotation.kind, quaternion, near[part].tolist())
+        return same
+
     def joined(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Return the command that moves the robot as `first` and then `second` do, (D,) float32."""
         row = np.array(second, np.float32)
@@ -181,8 +214,8 @@ class Columns:
             rows: The rows, (D,) each; the representation of a rotation is the nearest to the last.
             weights: The weight of each row, at least 0; their sum is above 0.
         """
-        total = math.fsum(weights)
-        row = np.asarray(np.asarray(weights) / total @ np.stack(rows), np.float32)
+        shares = np.asarray(weights) / np.sum(weights)
+        row = np.asarray(shares @ np.stack(rows), np.float32)
         for rotation in self.rotations:
             if not rotation.is_linear:
                 part = slice(rotation.start, rotation.stop)

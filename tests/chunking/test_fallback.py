@@ -48,8 +48,8 @@ def test_a_choice_that_would_or_might_move_the_robot_is_refused(
 
 
 def test_the_last_actions_gripper_is_held_and_an_own_action_taken_as_it_is() -> None:
-    spec = ActionSpec(delta=True)
-    assert SafeAction("zero", spec, [0, 2])(Obs(), LAST).tolist() == pytest.approx([0.3, 0, 0.8])
+    spec, arm = ActionSpec(delta=True), ActionSpec(names=("left_gripper", "elbow", "gripper"))
+    assert SafeAction("zero", spec, arm)(Obs(), LAST).tolist() == pytest.approx([0.3, 0, 0.8])
     home = np.array([1.0, 2.0, 3.0])
     own: list[Safe] = [home, lambda obs: obs.state["joints"]]
     for safe in own:
@@ -73,7 +73,7 @@ def test_before_the_first_action_a_gripper_is_kept_as_it_is_measured() -> None:
     assert SafeAction("auto", spec)(Obs(gripper=0.75), None).tolist() == [0, 0, 0.5]
     for unknown, obs in (
         (spec, Obs()),
-        (ActionSpec(dim=3, delta=True, gripper_open=1.0), Obs(gripper=1.0)),
+        (ActionSpec(dim=3, delta=True, gripper_open=1.0), Obs(gripper=0.5)),
     ):
         with pytest.raises(InvalidAction, match="before the first action"):
             SafeAction("auto", unknown)(obs, None)

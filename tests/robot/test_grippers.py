@@ -20,8 +20,11 @@ from vlagents_ray import (
     Obs,
     PlayerSettings,
 )
-from vlagents_ray.chunking.fallback import SafeAction, neutral
+from vlagents_ray.chunking.fallback import SafeAction
+from vlagents_ray.columns import Columns
 from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.evaluate.episode.latency import ChunkExecutor
+from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.interface import SAFE
 from vlagents_ray.robot import Guard, MotionLimits, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
@@ -58,12 +61,12 @@ def limits_of(arms: int, gripper: float) -> MotionLimits:
 
 
 def test_the_columns_are_the_last_of_each_arms_part() -> None:
-    assert spec_of(False, 1).gripper_columns(4) == [3]
-    assert spec_of(True, 2).gripper_columns(8) == [3, 7]
-    assert spec_of(True, 2).delta_columns(8) == [0, 1, 2, 4, 5, 6]
-    assert spec_of(False, 2).delta_columns(8) == []
-    assert ActionSpec(delta=True).gripper_columns(7) == []
-    assert ActionSpec(gripper_closed=0.0).gripper_columns(7) == [6], (
+    assert list(Columns.from_spec(spec_of(False, 1), 4).grippers) == [3]
+    assert list(Columns.from_spec(spec_of(True, 2), 8).grippers) == [3, 7]
+    assert list(Columns.from_spec(spec_of(True, 2), 8).relative) == [0, 1, 2, 4, 5, 6]
+    assert list(Columns.from_spec(spec_of(False, 2), 8).relative) == []
+    assert list(Columns.from_spec(ActionSpec(delta=True), 7).grippers) == []
+    assert list(Columns.from_spec(ActionSpec(gripper_closed=0.0), 7).grippers) == [6], (
         "this must also hold if only one end of the gripper is declared"
     )
 
@@ -77,7 +80,7 @@ UNEQUAL = ActionSpec(
     "use",
     [
         lambda: SafeAction("auto", UNEQUAL),
-        lambda: neutral(UNEQUAL),
+        lambda: ChunkExecutor(None, ClockConfig(latency=0.1, hz=10), Contract(action=UNEQUAL)),
         lambda: Guard(Contract(action=UNEQUAL)),
         lambda: SimulatedRobot(Contract(action=UNEQUAL)),
     ],
@@ -93,10 +96,13 @@ def test_a_safe_action_keeps_each_gripper_and_the_neutral_one_opens_all(
     delta: bool, arms: int
 ) -> None:
     spec = spec_of(delta, arms)
-    columns = spec.gripper_columns(4 * arms)
+    columns = list(Columns.from_spec(spec, 4 * arms).grippers)
     last = np.random.default_rng(0).uniform(-1, 1, 4 * arms).astype(np.float32)
     assert (SafeAction("auto", spec)(Obs(), last)[columns] == last[columns]).all()
-    assert (neutral(spec)[columns] == OPEN).all()
+    if delta:
+        first = Columns.from_spec(spec, 4 * arms).first_still(1.0)
+        assert first is not None
+        assert (first[columns] == OPEN).all()
 
 
 class Grasping(Agent):
@@ -110,7 +116,9 @@ class Grasping(Agent):
         self._random = np.random.default_rng(seed)
         self._change = largest_change
         self.rows = np.zeros((0, spec.dim or 0), np.float32)  # rows of all answers
-        self._gripper = np.array([OPEN, CLOSED, OPEN][: len(spec.gripper_columns(spec.dim or 0))])
+        self._gripper = np.array(
+            [OPEN, CLOSED, OPEN][: len(list(Columns.from_spec(spec, spec.dim or 0).grippers))]
+        )
 
     def act(self, obs: Obs) -> Act:
         if len(self.rows) and self._random.random() < 0.3:
@@ -125,7 +133,7 @@ class Grasping(Agent):
             )
             change = np.clip(target - self._gripper, -self._change, self._change)
             self._gripper = np.clip(self._gripper + change, CLOSED, OPEN)
-            row[spec.gripper_columns(dim)] = self._gripper
+            row[list(Columns.from_spec(spec, dim).grippers)] = self._gripper
         self.rows = np.concatenate([self.rows, rows.astype(np.float32)])
         return Act(rows.astype(np.float32))
 
@@ -139,7 +147,7 @@ def test_a_grippers_command_is_the_last_one_or_the_policys(
 ) -> None:
     """Ease-in, hold, lost answers, pauses and stops change no gripper without limits."""
     spec = spec_of(delta, arms)
-    columns = spec.gripper_columns(4 * arms)
+    columns = list(Columns.from_spec(spec, 4 * arms).grippers)
     policy = Grasping(spec, seed, largest_change=2.0)
     joints = np.full(4 * arms, 0.3, np.float32)
     measure = None if delta else (lambda obs: obs.state["joints"])
@@ -181,7 +189,7 @@ def test_a_gripper_with_limits_goes_from_the_last_command_to_the_policys_and_not
     delta: bool, arms: int
 ) -> None:
     spec = spec_of(delta, arms)
-    columns = spec.gripper_columns(4 * arms)
+    columns = list(Columns.from_spec(spec, 4 * arms).grippers)
 
     class Closing(Agent):
         contract = Contract(action=spec, chunk=200)
@@ -218,7 +226,7 @@ def test_the_way_to_rest_keeps_the_grippers(arms: int) -> None:
     guard = Guard(Contract(action=spec), limits=replace(limits_of(arms, 1.0), rest=rest), hz=HZ)
     last = np.array([0, 0, 0, -0.4, 0, 0, 0, 0.6][: 4 * arms], np.float32)
     way = np.array(list(guard.way_to_rest(last)))
-    columns = spec.gripper_columns(4 * arms)
+    columns = list(Columns.from_spec(spec, 4 * arms).grippers)
     assert (way[:, columns] == last[columns]).all()
     assert np.allclose(np.delete(way[-1], columns), (0.1, 0.2, 0.3) * arms)
 
@@ -229,7 +237,7 @@ def test_a_simulated_robot_has_its_grippers_where_they_were_commanded(
     delta: bool, arms: int
 ) -> None:
     spec = spec_of(delta, arms)
-    columns = spec.gripper_columns(4 * arms)
+    columns = list(Columns.from_spec(spec, 4 * arms).grippers)
 
     class Still(Agent):
         contract = Contract(action=spec, chunk=10)
@@ -260,7 +268,7 @@ def test_arms_whose_openings_are_unknown_stand_until_the_first_action_that_is_ac
             self.answers += 1
             rows = np.zeros((10, 8), np.float32)
             rows[:, 0] = 0.5 if self.answers < 4 else 0.001
-            rows[:, spec.gripper_columns(8)] = OPEN
+            rows[:, list(Columns.from_spec(spec, 8).grippers)] = OPEN
             return Act(rows)
 
     robot = SimulatedRobot(TooFast.contract)

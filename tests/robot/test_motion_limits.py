@@ -22,6 +22,7 @@ from vlagents_ray import (
     Obs,
     PlayerSettings,
 )
+from vlagents_ray.columns import Columns
 from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import SAFE
@@ -51,7 +52,7 @@ def spec_of(delta: bool, arms: int | None) -> ActionSpec:
 def path_of(spec: ActionSpec, actions: list[np.ndarray]) -> np.ndarray:
     """Return the commanded motion from rest, (T + 3, D). Relative actions are summed up."""
     rows = np.array(actions, np.float64)
-    deltas = spec.delta_columns(rows.shape[1])
+    deltas = list(Columns.from_spec(spec, rows.shape[1]).relative)
     rows[:, deltas] = np.cumsum(rows[:, deltas], axis=0)
     rest = rows[0].copy()
     rest[deltas] = 0.0
@@ -86,7 +87,7 @@ def test_no_accepted_sequence_exceeds_the_limits_from_the_first_action_on(
     guard = Guard(Contract(action=spec), limits=LIMITS, hz=HZ, soft_start_s=0)
     random = np.random.default_rng(seed)
     accepted: list[np.ndarray] = []
-    deltas = spec.delta_columns(spec.dim or 0)
+    deltas = list(Columns.from_spec(spec, spec.dim or 0).relative)
     last, motion = None, np.zeros(spec.dim or 0)
     for _ in range(2000):
         scale = 10 ** random.uniform(-4.5, 0.5)
@@ -119,14 +120,14 @@ def test_no_command_of_a_player_exceeds_the_limits_from_the_first_one_and_after_
             rows = np.full((100, dim), step, np.float32)
             if not delta:
                 rows = obs.state["joints"] + np.cumsum(rows, axis=0, dtype=np.float32)
-            rows[:, spec.gripper_columns(dim)] = 0.5
+            rows[:, list(Columns.from_spec(spec, dim).grippers)] = 0.5
             return Act(rows)
 
     pose = np.full(dim, 0.5, np.float32)
     measure = None if delta else (lambda obs: obs.state["joints"])
     guard = Guard(Contract(action=spec), limits=LIMITS, hz=HZ, soft_start_s=0, measure=measure)
     still = np.zeros(dim, np.float32)
-    still[spec.gripper_columns(dim)] = 0.5
+    still[list(Columns.from_spec(spec, dim).grippers)] = 0.5
     settings = PlayerSettings(deadline_s=30.0, safe=still if delta else "hold")
     with ChunkPlayer(Straight(), settings, check=guard) as player:
         player.initialize()
@@ -372,7 +373,7 @@ def demonstrations(spec: ActionSpec, seed: int) -> list[np.ndarray]:
         actions = np.sin(np.pi * time_s[:, None] / periods_s) ** 3 * random.uniform(
             0.2, 1.0, spec.dim or 1
         )
-        deltas = spec.delta_columns(spec.dim or 1)
+        deltas = list(Columns.from_spec(spec, spec.dim or 1).relative)
         moved = np.diff(actions, axis=0, prepend=0.0)
         actions[:, deltas] = moved[:, deltas]
         episodes.append(actions.astype(np.float32))

@@ -11,6 +11,7 @@ from scripted_leader import ScriptedLeader
 
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import COMMAND, CommandInbox
+from vlagents_ray.columns import Columns
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot.loop import LoopOptions, run_loop
@@ -228,6 +229,6 @@ def test_a_simulated_robot_stops_where_it_is_and_keeps_its_grasp(
     before = robot.observe().state["joints"]
     for _ in range(50):
         after = robot.observe().state["joints"]
-    grippers = spec.gripper_columns(dim)
+    grippers = list(Columns.from_spec(spec, dim).grippers)
     assert np.allclose(np.delete(after, grippers), np.delete(before, grippers))
     assert np.allclose(after[grippers], 1.0), "as commanded before the stop"

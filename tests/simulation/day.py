@@ -32,6 +32,7 @@ from vlagents_ray.chunking import buffer, player
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.client.commands import COMMAND, CommandInbox
+from vlagents_ray.columns import Columns
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import (
     ConnectionLost,
@@ -142,8 +143,8 @@ class World:
         self.action = ActionSpec(
             dim=len(REST) * arms, delta=relative, gripper_open=1.0, gripper_closed=0.0, arms=names
         )
-        self.deltas = self.action.delta_columns(len(REST) * arms)
-        self.grippers = self.action.gripper_columns(len(REST) * arms)
+        self.deltas = list(Columns.from_spec(self.action, len(REST) * arms).relative)
+        self.grippers = list(Columns.from_spec(self.action, len(REST) * arms).grippers)
         self.joints = np.tile(np.array(REST, np.float32), arms)
         self.target = self.joints.copy()
         self.commanded = self.joints.copy()  # the last command, or the rest pose

@@ -12,12 +12,14 @@ import functools
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from vlagents_ray.columns import Columns
+from vlagents_ray.contract import ActionSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
 from vlagents_ray.interface import (
     AGE,
@@ -43,12 +45,13 @@ Both actions and the result are (D,).
 
 # The names and weights of LeRobot 0.4.4, `lerobot/async_inference/configs.py`, AGGREGATE_FUNCTIONS;
 # its "latest_only" is called "newest" here.
-MERGES: Mapping[str, Merge] = {
-    "newest": lambda _, new: new,
-    "average": lambda old, new: 0.5 * old + 0.5 * new,
-    "weighted_average": lambda old, new: 0.3 * old + 0.7 * new,
-    "conservative": lambda old, new: 0.7 * old + 0.3 * new,
+MERGES: Mapping[str, float] = {
+    "newest": 1.0,
+    "average": 0.5,
+    "weighted_average": 0.7,
+    "conservative": 0.3,
 }
+"""The weight of a newer chunk's action in the mean with the action of the older chunks."""
 ENSEMBLE = "ensemble"
 ENSEMBLE_M = 0.01
 """The m of the weights exp(-m * i), where i = 0 is the oldest chunk, as in Zhao et al. 2023 (ACT,
@@ -111,7 +114,15 @@ class ChunkBuffer:
     (LeRobot's real-time chunking has the same rule since huggingface/lerobot#4454.)
     """
 
-    def __init__(self, merge: str | Merge = "newest", ensemble_m: float = ENSEMBLE_M) -> None:
+    action: ActionSpec
+    """The actions of the contract; the mean of rows depends on their columns."""
+
+    def __init__(
+        self,
+        merge: str | Merge = "newest",
+        ensemble_m: float = ENSEMBLE_M,
+        action: ActionSpec | None = None,
+    ) -> None:
         """Begin a plan without chunks; raises `ConfigError` if `merge` is an unknown name.
 
         Args:
@@ -119,12 +130,14 @@ class ChunkBuffer:
                 `MERGES`, "ensemble", or a function that is folded over the rows from the oldest
                 chunk to the newest.
             ensemble_m: The m of the ensemble's weights exp(-m * i), oldest first.
+            action: The actions of the contract, if it is known.
         """
         if isinstance(merge, str) and merge not in MERGES and merge != ENSEMBLE:
             raise ConfigError(
                 f"merge: expected one of {sorted([*MERGES, ENSEMBLE])} or a function, got {merge!r}"
             )
         self.executed = 0  # the number of executed actions of this plan
+        self.action = action or ActionSpec()
         self._merge = MERGES.get(merge) if isinstance(merge, str) else merge  # None: the ensemble
         self._newest = merge == "newest"
         self._m = ensemble_m
@@ -243,12 +256,27 @@ class ChunkBuffer:
         rows = [chunk.rows[index - chunk.step] for chunk in chunks]
         if len(rows) == 1:
             action = rows[0]
-        elif self._merge is None:
-            weights = np.array([math.exp(-self._m * i) for i in range(len(rows))])
-            action = np.asarray((weights / weights.sum()) @ np.stack(rows), np.float32)
-        else:
+        elif callable(self._merge):
             action = np.asarray(functools.reduce(self._merge, rows), np.float32)
+        else:
+            action = self._mean(rows, self._merge)
         return Step(action, newest, row)
+
+    def _mean(self, rows: Sequence[np.ndarray], newer: float | None) -> np.ndarray:
+        """Return the mean of the rows of several chunks for a step, oldest first, (D,) float32.
+
+        Args:
+            rows: The rows, (D,) each.
+            newer: The weight of each newer row in the mean with the older ones; None for the
+                weights of the ensemble.
+        """
+        columns = Columns.from_spec(self.action, len(rows[0]))
+        if newer is None:
+            return columns.mean(rows, [math.exp(-self._m * i) for i in range(len(rows))])
+        mean = rows[0]
+        for row in rows[1:]:
+            mean = columns.mean([mean, row], [1.0 - newer, newer])
+        return mean
 
 
 # The number of answers that may include a cold start: the first answers that continue a plan may

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vlagents_ray.columns import Columns
+
 _ROUNDING = 1e-9
 
 
@@ -27,30 +29,30 @@ class EaseIn:
     brake.
 
     Args:
-        start: The pose at rest, (D,), in the action's units. Its values in delta columns are not
-            used.
-        approach: The number of ticks until the first row: at least 1 if the row is a pose, 0 if the
-            row has only deltas.
+        columns: The meaning of the columns: targets are approached, and motions are divided.
+        start: The pose at rest, (D,), in the action's units. Its motions are not used.
+        approach: The number of ticks until the first row: at least 1 if the row has only targets, 0
+            if it may begin at once.
         ramp: The number of ticks until full speed, an even number.
-        deltas: The columns that are deltas, which are scaled instead of approached.
         at_once: The columns of grippers without limits. Their commands are the unchanged values of
             the rows.
     """
 
     def __init__(
         self,
+        columns: Columns,
         start: np.ndarray,
         approach: int,
         ramp: int,
         *,
-        deltas: Sequence[int] = (),
         at_once: Sequence[int] = (),
     ) -> None:
+        self._columns = columns
         self._from = start
         self._approach, self._ramp = approach, ramp
-        self._deltas, self._at_once = list(deltas), list(at_once)
-        # A row of deltas is a motion, so the ramp begins before the row.
-        self._is_motion = bool(self._deltas)
+        self._at_once = list(at_once)
+        # A row of motions is a motion, so the ramp begins before the row.
+        self._is_motion = bool(columns.relative)
         self._tick = -approach  # tick of the ramp, negative during the approach
         self._speed = 0.0 if ramp else 1.0  # rows per tick
         self._rise = 0.0  # increase of the speed per tick
@@ -93,8 +95,7 @@ class EaseIn:
         if self._tick <= 0:  # the approach
             share = 1.0 + self._tick / self._approach
             share *= share * share * (10.0 - 15.0 * share + 6.0 * share * share)
-            command = self._between(action, share)
-            command[self._deltas] = 0.0
+            command = self._part(action, share, share)
             if self._tick < 0:
                 return command, 0
             self._from = action
@@ -105,22 +106,17 @@ class EaseIn:
         before, self._position = self._position, self._next_position()
         row = int(self._position)
         share = self._position - row
+        begin = before - int(before)
         if row == int(before):  # The command is still before the next row.
-            command = self._between(action, share)
-            command[self._deltas] = (self._position - before) * action[self._deltas]
-            return command, 0
+            return self._part(action, begin, share), 0
 
+        command = self._part(action, begin, 1.0)
         self._from = action
         if after is None or share == 0.0:
             # A shorter plan ends the section.
             self._ticks = self._ticks if after is not None else 0
-            command = action.copy()
-            command[self._deltas] = (row - before) * action[self._deltas]
             return command, 1
-
-        command = self._between(after, share)
-        command[self._deltas] = (row - before) * action[self._deltas] + share * after[self._deltas]
-        return command, 1
+        return self._columns.joined(command, self._part(after, 0.0, share)), 1
 
     def _begin_section(self, known: int) -> None:
         """Begin a section of the ramp, which ends at full speed or at the last known row."""
@@ -171,10 +167,10 @@ class EaseIn:
         """Return whether a speed is at most one tick's increase below full speed."""
         return speed * self._ramp >= self._ramp - 1 - _ROUNDING
 
-    def _between(self, action: np.ndarray, share: float) -> np.ndarray:
-        """Return the pose at a fraction of the path to an action, (D,) float32."""
-        if share == 1.0:
-            return action.copy()
-        command = np.asarray(self._from + share * (action - self._from), np.float32)
+    def _part(self, action: np.ndarray, begin: float, end: float) -> np.ndarray:
+        """Return the command for a part of the way to an action, (D,) float32; see
+        `Columns.travel`.
+        """
+        command = self._columns.travel(self._from, action, begin, end)
         command[self._at_once] = action[self._at_once]
         return command

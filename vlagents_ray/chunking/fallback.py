@@ -5,13 +5,14 @@ command.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from vlagents_ray.chunking.buffer import ChunkBuffer
 from vlagents_ray.chunking.ease import EaseIn
+from vlagents_ray.columns import Columns
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import (
     ConfigError,
@@ -88,132 +89,107 @@ Safe = SafeName | np.ndarray | Callable[[Obs], np.ndarray]
 
 
 class SafeAction:
-    """Computes the action that holds a robot still, which depends on the meaning of its actions.
+    """Computes the action that holds a robot still, which depends on the meaning of each column.
 
-    "hold" repeats the last command, which is right for absolute targets. "zero" commands no motion,
-    which is right for deltas and velocities. The columns in `grippers` keep the value of the last
-    action, since 0 would half open a gripper whose command is a position. Before the first action,
-    a single gripper keeps its measured opening. "auto" chooses according to the contract's
-    `ActionSpec`. An array (D,), or a function of the observation that returns one (for instance of
-    the measured joints), is used unchanged.
+    Targets keep the value of the last command, and motions are none. The name of the safe action
+    confirms this meaning: "hold" is allowed if all columns are targets, "zero" if any column is a
+    motion, and "auto" if the contract declares which. Before the first action, a single gripper
+    keeps its measured opening. An array (D,), or a function of the observation that returns one
+    (for instance of the measured joints), is used unchanged.
 
     Args:
         safe: The name, array or function of the safe action.
         spec: The actions of the contract.
-        grippers: The columns of the grippers, by default `ActionSpec.gripper_columns`.
+        arm: The actions of the arm's contract, if it is known; see `Columns.from_spec`.
 
     Raises:
         ConfigError: The choice would be a guess or would move the robot: a repeated delta continues
             the motion, and zeros as joint targets move the arm to its zero position. Only "hold" is
             allowed if the contract does not describe the actions. The error is also raised if the
-            numbers of an action cannot be divided equally among the contract's arms.
+            contract contradicts itself.
     """
 
-    def __init__(self, safe: Safe, spec: ActionSpec, grippers: Sequence[int] | None = None) -> None:
-        if isinstance(safe, str):
-            if safe not in get_args(SafeName):
-                raise ConfigError(
-                    f"safe: expected one of {list(get_args(SafeName))}, an array or a function, "
-                    f"got {safe!r}"
-                )
-            if spec.relative is None and safe != "hold":
-                raise ConfigError(
-                    "safe: expected a policy whose contract declares whether its actions are "
-                    f"relative or absolute, got safe={safe!r} with one that does not; declare it "
-                    "(ActionSpec.delta), give safe='hold', which is right only for absolute "
-                    "actions, or give an action"
-                )
-
-            self._make: Safe = stopping(spec)
-            if safe not in ("auto", self._make):
-                if safe == "zero":
-                    consequence = "absolute actions would take as a pose to move to"
-                else:
-                    consequence = "relative actions would continue to move with"
-                raise ConfigError(
-                    f"safe: expected {self._make!r} or 'auto', got {safe!r}, which {consequence}; "
-                    "give one of them"
-                )
-        else:
-            self._make = safe if callable(safe) else np.asarray(safe, np.float32)
-
-        self._grippers = None if grippers is None else list(grippers)
-        self._spec = spec
+    def __init__(self, safe: Safe, spec: ActionSpec, arm: ActionSpec | None = None) -> None:
+        self._spec, self._arm = spec, arm
+        self._name = safe if isinstance(safe, str) else None
+        self._make = safe if callable(safe) else None
+        self._action = None
+        if self._name is not None:
+            _require_safe(self._name, spec, arm)
+        elif self._make is None:
+            self._action = np.asarray(safe, np.float32)
         if spec.dim is not None:
-            self._gripper_columns(spec.dim)
-        self.holds = spec.relative is False or (isinstance(safe, str) and safe == "hold")
-        """Whether repeating the last action keeps the robot in place."""
+            self._columns(spec.dim)  # raises the errors of the contract
 
     def __call__(self, obs: Obs, last: np.ndarray | None) -> np.ndarray:
         """Return the safe action, (D,) float32.
 
         It may depend on the last command; raises `InvalidAction` if there is none.
         """
-        if callable(self._make):
+        if self._make is not None:
             return np.asarray(self._make(obs), np.float32)
-        if isinstance(self._make, np.ndarray):
-            return self._make.copy()
+        if self._action is not None:
+            return self._action.copy()
+        if last is not None:
+            return self._columns(len(last)).still(last)
 
-        if last is None:
-            first = self._first(obs) if self._make == "zero" else None
-            if first is not None:
-                return first
+        first = None if self._spec.dim is None else self._first(obs, self._columns(self._spec.dim))
+        if first is None:
             raise InvalidAction(
-                f"safe: expected an action before it, got {self._make!r} before the first action; "
+                f"safe: expected an action before it, got {self._name!r} before the first action; "
                 "give an array or a function as the safe action"
             )
-        if self._make == "hold":
-            return last.copy()
+        return first
 
-        action = np.zeros_like(last)
-        grippers = self._gripper_columns(len(last))
-        action[grippers] = last[grippers]
-        return action
+    def holds(self, last: np.ndarray) -> bool:
+        """Return whether repeating the last command, (D,), keeps the robot in place."""
+        columns = self._columns(len(last))
+        return not columns.relative and (columns.is_known or self._name == "hold")
 
-    def _gripper_columns(self, dim: int) -> list[int]:
-        return self._spec.gripper_columns(dim) if self._grippers is None else self._grippers
+    def _columns(self, dim: int) -> Columns:
+        return Columns.from_spec(self._spec, dim, self._arm)
 
-    def _first(self, obs: Obs) -> np.ndarray | None:
+    def _first(self, obs: Obs, columns: Columns) -> np.ndarray | None:
         """Return an action without motion that holds the gripper, (D,); None if the contract is
         not sufficient.
         """
-        spec = self._spec
-        if spec.dim is None:
-            return None
-
-        action = np.zeros(spec.dim, np.float32)
-        grippers = self._gripper_columns(spec.dim)
-        if grippers:
-            closed, opened = spec.gripper_closed, spec.gripper_open
-            # An observation contains the opening of a single gripper, which is not sufficient for
-            # several grippers.
-            if len(grippers) > 1 or obs.gripper is None or closed is None or opened is None:
-                return None
-            action[grippers] = closed + obs.gripper * (opened - closed)
-        return action
+        # An observation contains the opening of a single gripper, which is not sufficient for
+        # several grippers.
+        opening = None if len(columns.grippers) > 1 else obs.gripper
+        return columns.first_still(opening)
 
 
-def stopping(spec: ActionSpec) -> SafeName:
-    """Return the action that keeps a robot still: "zero" if its actions are known to be
-    relative, otherwise "hold".
+def _require_safe(name: str, spec: ActionSpec, arm: ActionSpec | None) -> None:
+    """Raise `ConfigError` if the safe action with this name would be a guess, or would move the
+    robot.
     """
-    return "zero" if spec.relative else "hold"
-
-
-def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
-    """Return an action without motion for relative actions, (D,) float32.
-
-    The grippers are open if `spec` defines the value for it.
-    """
-    dim = spec.dim if dim is None else dim
-    if dim is None:
-        raise InvalidAction(
-            "neutral action: expected a contract with action.dim, got one without; add it"
+    if name not in get_args(SafeName):
+        raise ConfigError(
+            f"safe: expected one of {list(get_args(SafeName))}, an array or a function, "
+            f"got {name!r}"
         )
-    action = np.zeros(dim, np.float32)
-    if spec.gripper_open is not None:
-        action[spec.gripper_columns(dim)] = spec.gripper_open
-    return action
+    if spec.relative is None and name != "hold":
+        raise ConfigError(
+            "safe: expected a policy whose contract declares whether its actions are "
+            f"relative or absolute, got safe={name!r} with one that does not; declare it "
+            "(ActionSpec.delta), give safe='hold', which is right only for absolute "
+            "actions, or give an action"
+        )
+
+    if spec.dim is None:
+        has_motions = bool(spec.relative)
+    else:
+        has_motions = bool(Columns.from_spec(spec, spec.dim, arm).relative)
+    expected = "zero" if has_motions else "hold"
+    if name not in ("auto", expected) and spec.relative is not None:
+        if name == "zero":
+            consequence = "absolute actions would take as a pose to move to"
+        else:
+            consequence = "relative actions would continue to move with"
+        raise ConfigError(
+            f"safe: expected {expected!r} or 'auto', got {name!r}, which {consequence}; "
+            "give one of them"
+        )
 
 
 Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
@@ -230,9 +206,15 @@ class Motion:
     """
 
     def __init__(
-        self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None
+        self,
+        check: Check | None,
+        contract: Contract | None = None,
+        safe: SafeAction | None = None,
+        arm: ActionSpec | None = None,
     ) -> None:
         self._check, self._contract, self._safe = check, contract, safe
+        self._spec = ActionSpec() if contract is None else contract.action
+        self._arm = arm
         self.can_hold = safe is not None  # whether the action that keeps the robot still is known
         self._ease: EaseIn | None = None  # the ease-in, while a motion begins from rest
         self._last: np.ndarray | None = None  # the last commanded action
@@ -276,7 +258,7 @@ class Motion:
                 self._last, self._state = self._checked(action, self._last), "moving"
                 return self._last
 
-        last = self._last if self._state == "moving" else self._standing(obs)
+        last = self._last if self._state == "moving" else self._begins_at(action, obs)
         self._last, self._state = self._checked(action, last), "moving"
         return self._last
 
@@ -301,7 +283,7 @@ class Motion:
 
         ease_in = getattr(self._check, "ease_in", None)
         if self._state != "moving" and ease_in is not None:
-            start = self._last if self._state == "held" else self._standing(obs)
+            start = self._last if self._state == "held" else self._begins_at(action, obs)
             ease = ease_in(start, action, plan=plan.leftover())
             if ease is not None:
                 self._ease, self._last, self._state = ease, start, "moving"
@@ -337,7 +319,7 @@ class Motion:
             why = why._replace(
                 reason=f"{why.reason}; the guard also rejects the safe action: {refused}"
             )
-            if last is None or not self._safe.holds:
+            if last is None or not self._safe.holds(last):
                 raise InvalidAction(
                     f"no action for this tick: {why.reason}; change the guard's limits, or give "
                     "another safe action (safe=)"
@@ -347,6 +329,19 @@ class Motion:
         self._state = "held" if self._state == "moving" else self._state
         self._last = action
         return action.copy(), why
+
+    def _begins_at(self, action: np.ndarray, obs: Obs) -> np.ndarray | None:
+        """Return the position at which the motion to an action begins, (D,); None if it is unknown.
+
+        Before the first command, the goals of the grippers are unknown. Their measured openings are
+        not their goals: a gripper that holds an object would open if it were commanded to stay as
+        it is measured. Its first command is therefore the value of the action.
+        """
+        start = self._standing(obs)
+        if self._last is None and start is not None and start.shape == np.shape(action):
+            grippers = list(Columns.from_spec(self._spec, len(start), self._arm).grippers)
+            start[grippers] = np.asarray(action, np.float32)[grippers]
+        return start
 
     def _standing(self, obs: Obs) -> np.ndarray | None:
         """Return the robot's position, (D,); None if it is unknown."""
@@ -363,4 +358,9 @@ class Motion:
                 f"action: expected a single row (D,), got shape {action.shape}; pass one row of "
                 "the chunk"
             )
-        return action if self._check is None else self._check(action, last)
+        if self._check is not None:
+            return self._check(action, last)
+        if self._spec.rotation is not None:
+            columns = Columns.from_spec(self._spec, len(action), self._arm)
+            columns.require_rotations(action.tolist())
+        return action

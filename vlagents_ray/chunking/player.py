@@ -7,7 +7,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, get_args
 
@@ -193,8 +193,6 @@ class PlayerSettings:
     first, or since the call of `act` (see `CaptureClock`).
     """
     safe: Safe = "auto"  # action that replaces a missing one (see `SafeAction`)
-    # The columns of grippers in an action (see `SafeAction`).
-    grippers: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
@@ -276,6 +274,7 @@ class ChunkPlayer(Agent):
         self._plan = ChunkBuffer(merge, settings.ensemble_m)
         self._caller: AsyncCaller | None = None
         self._contract: Contract | None = None
+        self._arm: ActionSpec | None = None  # the actions of the arm's contract
         self._delay = DelayEstimate()
         self._begin()
 
@@ -326,6 +325,23 @@ class ChunkPlayer(Agent):
         trained_on = ability(self._agent, HasStatistics)
         self.statistics = None if trained_on is None else trained_on.statistics
         self._choose_safe()
+
+    def join(self, arm: ActionSpec) -> None:
+        """Join the arm's description of its columns to the policy's, before a `reset`.
+
+        The arm may know grippers that the policy's contract does not declare. The check, such as a
+        `vlagents_ray.robot.Guard`, gets the same description.
+
+        Args:
+            arm: The actions of the robot's contract.
+
+        Raises:
+            ConfigError: The descriptions contradict each other.
+        """
+        self._arm = arm
+        join = getattr(self.check, "join", None)
+        if join is not None:
+            join(arm)
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode, without a time limit. The plan and pending requests are dropped."""
@@ -462,8 +478,9 @@ class ChunkPlayer(Agent):
         spec = ActionSpec() if self._contract is None else self._contract.action
         safe: SafeAction | None = None
         if self.settings.deadline_s is not None or self.control.leader is not None:
-            safe = SafeAction(self.settings.safe, spec, self.settings.grippers)
-        self._motion = Motion(self.check, self._contract, safe)
+            safe = SafeAction(self.settings.safe, spec, self._arm)
+        self._plan.action = spec
+        self._motion = Motion(self.check, self._contract, safe, self._arm)
 
     def _record_replacement(self, action: np.ndarray) -> None:
         """Record an action that replaces the policy's action."""

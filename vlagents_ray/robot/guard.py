@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from vlagents_ray.chunking.ease import EaseIn
+from vlagents_ray.columns import Columns
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, MissingState
 from vlagents_ray.interface import Obs
@@ -34,8 +36,9 @@ class Guard:
     stop the arm may not be where the last action commanded it. With `measure`, the first action and
     an action after a stop are compared with the measured pose, and their grippers with the last
     command. Without `measure`, the first absolute action may be anywhere within the bounds, and an
-    action after a stop is compared with the last action. Relative actions are compared with zero,
-    i.e. no motion; their grippers, which are positions, are compared with the last command.
+    action after a stop is compared with the last action. Motions are compared with no motion, even
+    after a stop. The difference of a rotation is its angle, rad, in any representation; the
+    strictest limit of the rotation's numbers applies to it.
 
     With `limits`, speed, acceleration, jerk and the position of the tip are also checked. Braking
     is always allowed, as the robot's own stop is more abrupt. A chunk player then begins each
@@ -51,7 +54,7 @@ class Guard:
         max_step: Largest difference between two consecutive actions, for all numbers or (D,); None
             checks none.
         measure: Returns the measured pose in an observation, (D,) in the action's order and units,
-            e.g. `lambda obs: obs.state["joints"]`; not for relative actions.
+            e.g. `lambda obs: obs.state["joints"]`; not for actions whose numbers are all motions.
         limits: The limits of the robot's motion, or the path that `MotionLimits.read` reads.
         hz: The control rate, Hz; needed with `limits`.
         soft_start_s: The time of motion, s, during which the limits of speed, acceleration and jerk
@@ -59,9 +62,9 @@ class Guard:
             first minutes of a new checkpoint; 0 disables the soft start.
 
     Raises:
-        ConfigError: A bound is NaN, `max_step` is negative, `measure` is given for relative
-            actions, `limits` is given without `hz`, or a limit has no effect on the actions of the
-            contract.
+        ConfigError: A bound is NaN or has another number of values than an action, `max_step` is
+            negative, `measure` is given for relative actions, `limits` is given without `hz`, a
+            limit has no effect on the actions of the contract, or the contract contradicts itself.
     """
 
     def __init__(
@@ -85,33 +88,33 @@ class Guard:
         self._dim = spec.dim
 
         bounds = limits or MotionLimits()
-        self._low = _strictest("low", np.maximum, spec.low, low, bounds.low)
-        self._high = _strictest("high", np.minimum, spec.high, high, bounds.high)
+        self._low = _strictest("low", np.maximum, spec, spec.low, low, bounds.low)
+        self._high = _strictest("high", np.minimum, spec, spec.high, high, bounds.high)
         self._max_step = None if max_step is None else np.asarray(max_step, np.float64)
 
         # This also rejects NaN, which would accept any step.
         if self._max_step is not None and not (self._max_step >= 0).all():
             raise ConfigError(f"max_step: expected a number of 0 or more, or None, got {max_step}")
-        if measure is not None and spec.relative:
-            raise ConfigError(
-                "measure: expected None for relative actions, which cannot be compared with a "
-                "pose, got a function; leave it out"
-            )
         if limits is not None and (hz is None or not hz > 0 or not soft_start_s >= 0):
             raise ConfigError(
                 "limits: expected a control rate above 0 Hz, and a soft start of 0 s or more, "
                 f"got hz={hz}, soft_start_s={soft_start_s}"
             )
 
+        if measure is not None and spec.dim is None and spec.relative and not spec.absolute:
+            raise _not_measurable()
         self._measure = measure
         self._soft_ticks = soft_start_s * (hz or 0.0)
         self._ticks_with_motion = 0
 
+        self._arm: ActionSpec | None = None  # the actions of the arm's contract
+        self._columns: Columns | None = None  # the meaning of the numbers of an action
         # The limits low, high, max_step, velocity, acceleration and jerk, each with a value for
         # each number of an action, in the action's units and in ticks.
-        self._columns: list[list[float]] = []
-        self._grippers: list[int] = []  # the indices of the grippers in an action
-        self._deltas: list[int] = []  # the indices of the relative numbers
+        self._limits: list[list[float]] = []
+        # Columns of rotations, whose differences are vectors, and all other columns.
+        self._turns: list[tuple[int, ...]] = []
+        self._numbers: list[int] = []
 
         self._accepted: list[float] | None = None  # the last accepted action; None at rest
         # speeds: differences between the last accepted action and the action before, units per
@@ -120,6 +123,23 @@ class Guard:
         self._changes: list[float] = []  # differences between these speeds and the speeds before
         if self._dim is not None:
             self._limits_of(self._dim)
+
+    def join(self, arm: ActionSpec) -> None:
+        """Join the arm's description of its columns to the policy's.
+
+        The arm may know grippers that the policy's contract does not declare.
+
+        Args:
+            arm: The actions of the robot's contract.
+
+        Raises:
+            ConfigError: The descriptions contradict each other or the limits.
+        """
+        self._arm = arm
+        dim = self._dim if self._columns is None else self._columns.dim
+        self._columns = None
+        if dim is not None:
+            self._limits_of(dim)
 
     def reference(self, obs: Obs, last: np.ndarray | None) -> np.ndarray | None:
         """Return the pose with which the first action, or the first action after a stop, is
@@ -137,13 +157,9 @@ class Guard:
             InvalidAction: `measure` returns NaN or infinity, so that no action can be checked.
         """
         self._accepted = None
-        if last is not None and self._spec.relative:
-            self._limits_of(len(last))
-            standing = last.copy()
-            standing[self._deltas] = 0.0  # zeros: the robot does not move
-            return standing
+        columns = None if last is None else self._columns_of(len(last))
         if self._measure is None:
-            return last
+            return last if columns is None or last is None else columns.still(last)
 
         pose = np.array(self._measure(obs), np.float32)
         dim = self._dim if last is None else len(last)
@@ -158,12 +174,12 @@ class Guard:
                 "broken"
             )
 
-        if last is not None:
-            self._limits_of(len(last))
+        if columns is not None and last is not None:
             # Grippers keep their last command, since commanding the measured opening would loosen
             # the grasp.
-            pose[self._grippers] = last[self._grippers]
-        return pose
+            grippers = list(columns.grippers)
+            pose[grippers] = last[grippers]
+        return self._columns_of(len(pose)).still(pose)
 
     def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
         """Return an action if the robot may execute it.
@@ -193,7 +209,9 @@ class Guard:
                 f"action: expected finite numbers, got {numbers}; check the policy's output"
             )
 
-        low, high, steps, *dynamic_limits = self._limits_of(len(numbers))
+        low, high, *_ = self._limits_of(len(numbers))
+        columns = self._columns_of(len(numbers))
+        columns.require_rotations(numbers)
         for i, number in enumerate(numbers):
             if not low[i] <= number <= high[i]:
                 name, limit = ("below", low[i]) if number < low[i] else ("above", high[i])
@@ -211,22 +229,13 @@ class Guard:
             )
         if last is None:  # the arm is at rest in an unknown pose
             self._accepted = None
-            last_numbers = numbers.copy()
-            for i in self._deltas:
-                last_numbers[i] = 0.0
+            last_numbers = columns.still(action).tolist()
         else:
             last_numbers = last.tolist()
 
-        for i, (number, last_number) in enumerate(zip(numbers, last_numbers, strict=True)):
-            rounding = 2 * _ROUNDING * max(abs(number), abs(last_number))
-            if abs(number - last_number) > steps[i] + rounding:
-                raise InvalidAction(
-                    f"action[{i}]: expected a step of at most max_step, {steps[i]:.3g}, got "
-                    f"{number:g} after {last_number:g}",
-                    cause="max_step",
-                )
+        self._check_steps(columns, numbers, last_numbers)
         if self.limits is not None:
-            self._check_dynamics(numbers, last_numbers, dynamic_limits)
+            self._check_dynamics(columns, numbers, last_numbers)
         return action
 
     def ease_in(
@@ -254,42 +263,47 @@ class Guard:
         Raises:
             InvalidAction: The action is farther from the pose than `MotionLimits.first`.
         """
-        if self.limits is None or (start is None and not self._spec.relative):
+        if self.limits is None:
             return None
-        *_, velocity, acceleration, jerk = self._limits_of(len(goal))
-        if start is None:  # actions are relative, and the positions of the grippers are unknown
-            start = goal
+        columns = self._columns_of(len(goal))
+        if start is None:
+            if len(columns.absolute) > len(columns.grippers):
+                return None
+            start = goal  # all numbers are motions, and the positions of the grippers are unknown
         if start.shape != goal.shape:
             return None
-        if not (far or self._spec.relative):
-            self._check_first(self.limits, start, goal, velocity)
+
+        distances = columns.step(columns.still(goal).tolist(), columns.still(start).tolist())
+        if not far:
+            self._check_first(self.limits, columns, start, goal, distances)
         dynamic_limits = (self.limits.velocity, self.limits.acceleration, self.limits.jerk)
         if all(limit is None for limit in dynamic_limits):
             return None
 
         # Grippers without limits jump to their position.
+        *_, velocity, acceleration, jerk = self._limits_of(len(goal))
         at_once = []
-        for i in self._grippers:
+        for i in columns.grippers:
             if velocity[i] == acceleration[i] == jerk[i] == math.inf:
                 at_once.append(i)
 
-        distances = np.abs(goal.astype(np.float64) - start)
-        distances[self._deltas + at_once] = 0.0
-        plan_speeds = self._plan_speeds(goal if plan is None else plan).tolist()
+        plan_speeds = self._plan_speeds(columns, goal if plan is None else plan)
         share = self._softness()
         ramp_ticks = 0.0
         approach_ticks = 0.0
-        for i, distance in enumerate(distances.tolist()):
+        for i in range(len(goal)):
+            if i in at_once:
+                continue
             max_speed = share * velocity[i]
             max_acceleration = share * acceleration[i]
             max_jerk = share * jerk[i]
 
-            if i not in at_once:
-                # The other half of the acceleration and jerk remains for the policy's own motion.
-                speed = max_speed if max_speed < math.inf else 2 * plan_speeds[i]
-                ramp_ticks = max(ramp_ticks, 2 * speed / max_acceleration, 2 * speed / max_jerk)
+            # The other half of the acceleration and jerk remains for the policy's own motion.
+            speed = max_speed if max_speed < math.inf else 2 * plan_speeds[i]
+            ramp_ticks = max(ramp_ticks, 2 * speed / max_acceleration, 2 * speed / max_jerk)
 
             # The peaks of the quintic over T ticks: 1.875 D / T, 5.7735 D / T^2, 60 D / T^3.
+            distance = abs(distances[i])
             fastest_ticks = max(
                 1.875 * distance / max_speed,
                 math.sqrt(5.7735 * distance / max_acceleration),
@@ -298,38 +312,54 @@ class Guard:
             approach_ticks = max(approach_ticks, _SLOWNESS * fastest_ticks)
 
         ticks = math.ceil(approach_ticks)
-        if not self._deltas:
+        if not columns.relative:
             ticks = max(1, ticks)
         even_ramp_ticks = 2 * math.ceil(ramp_ticks / 2)
-        return EaseIn(start, ticks, even_ramp_ticks, deltas=self._deltas, at_once=at_once)
+        return EaseIn(columns, start, ticks, even_ramp_ticks, at_once=at_once)
 
     def _check_first(
-        self, limits: MotionLimits, start: np.ndarray, goal: np.ndarray, velocity: list[float]
+        self,
+        limits: MotionLimits,
+        columns: Columns,
+        start: np.ndarray,
+        goal: np.ndarray,
+        distances: Sequence[float],
     ) -> None:
         """Raise `InvalidAction` if the first action is too far from the pose at rest."""
         dim, hz = len(goal), self.hz or 0.0
         if limits.first is None:
+            velocity = self._limits_of(dim)[3]
             allowed = [limit * hz * _FIRST_S for limit in velocity]
         else:
-            allowed = np.broadcast_to(np.asarray(limits.first, np.float64), dim).tolist()
+            allowed = self._per_number("first", limits.first, dim)
 
-        for i, (begin, end) in enumerate(zip(start.tolist(), goal.tolist(), strict=True)):
-            distance = abs(end - begin)
-            if distance > allowed[i] + 2 * _ROUNDING * max(abs(begin), abs(end)):
+        # Motions begin anywhere, and so do the grippers beside them.
+        anywhere = {*columns.relative, *columns.grippers} if columns.relative else set()
+        begins, ends = start.tolist(), goal.tolist()
+        for i, distance in self._sizes(distances):
+            rounding = 2 * _ROUNDING * max(abs(begins[i]), abs(ends[i]))
+            if i not in anywhere and distance > allowed[i] + rounding:
                 raise InvalidAction(
                     f"action[{i}]: expected a first action at most {allowed[i]:.3g} from the pose "
-                    f"{begin:g}, got {end:g}, {distance:g} away; check that the policy is for "
-                    "this arm, and the order and units of the joints; if all are right, raise "
+                    f"{begins[i]:g}, got {ends[i]:g}, {distance:g} away; check that the policy is "
+                    "for this arm, and the order and units of the joints; if all are right, raise "
                     "`first`",
                     cause="max_step",
                 )
 
-    def _plan_speeds(self, plan: np.ndarray) -> np.ndarray:
-        """Return the largest speed of each number in the rows of a plan, (D,) units per tick."""
-        rows = np.atleast_2d(plan).astype(np.float64)
-        speeds: np.ndarray = np.abs(np.diff(rows, axis=0)).max(0, initial=0.0)
-        speeds[self._deltas] = np.abs(rows[:, self._deltas]).max(0)
-        return speeds
+    def _plan_speeds(self, columns: Columns, plan: np.ndarray) -> list[float]:
+        """Return the largest speed of each number in the rows of a plan, D units per tick."""
+        rows = np.atleast_2d(plan).tolist()
+        if columns.rotations:
+            motions = [
+                columns.motion(row, last) for last, row in itertools.pairwise(rows[:1] + rows)
+            ]
+            return np.abs(motions).max(0).tolist()  # type: ignore[no-any-return]
+        numbers = np.asarray(rows)
+        speeds: np.ndarray = np.abs(np.diff(numbers, axis=0)).max(0, initial=0.0)
+        relative = list(columns.relative)
+        speeds[relative] = np.abs(numbers[:, relative]).max(0)
+        return speeds.tolist()  # type: ignore[no-any-return]
 
     def way_to_rest(self, last: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the commands of a slow motion to the rest pose; yield none if `limits` has no rest
@@ -343,11 +373,19 @@ class Guard:
         """
         if self.limits is None or self.limits.rest is None:
             return
-        self._limits_of(len(last))
-        rest_pose = last.copy()
+        columns = self._columns_of(len(last))
+        rest_pose = columns.still(last)
+        last = rest_pose.copy()
         for i, number in enumerate(self.limits.rest):
             if number is not None:
                 rest_pose[i] = number
+
+        # Of equal rotations, the nearest numbers let a robot that interpolates numbers turn the
+        # short way.
+        nearest = columns.nearest(rest_pose, last)
+        low, high, *_ = self._limits_of(len(last))
+        if ((low <= nearest) & (nearest <= high)).all():
+            rest_pose = nearest
 
         ease = self.ease_in(last, rest_pose, far=True)
         yield last  # the motion begins at rest
@@ -355,9 +393,15 @@ class Guard:
             command, _ = ease.step(rest_pose, None, 1)
             yield command
 
+    def _columns_of(self, dim: int) -> Columns:
+        """Return the meaning of the numbers of an action; raises the errors of `_limits_of`."""
+        self._limits_of(dim)
+        assert self._columns is not None  # noqa: S101 - set by `_limits_of`
+        return self._columns
+
     def _limits_of(self, dim: int) -> list[list[float]]:
-        """Return the limits of each number of an action (see `_columns`), and determine the indices
-        of grippers and relative numbers.
+        """Return the limits of each number of an action (see `_limits`), and determine the meaning
+        of the numbers.
 
         Args:
             dim: The number of values in an action.
@@ -365,57 +409,93 @@ class Guard:
         Raises:
             ConfigError: The limits do not fit the contract's description of the actions.
         """
-        if self._columns and len(self._columns[0]) == dim:
-            return self._columns
+        if self._columns is not None and self._columns.dim == dim:
+            return self._limits
 
         limits = self.limits or MotionLimits()
         tick_s = 1.0 / (self.hz or 1.0)
-        self._grippers = self._spec.gripper_columns(dim)
-        self._deltas = self._spec.delta_columns(dim)
-        try:
-            columns = [
-                np.broadcast_to(-math.inf if self._low is None else self._low, dim).tolist(),
-                np.broadcast_to(math.inf if self._high is None else self._high, dim).tolist(),
-                _tolerant(math.inf if self._max_step is None else self._max_step, dim),
-            ]
-            dynamic_limits = (limits.velocity, limits.acceleration, limits.jerk)
-            for order, limit in enumerate(dynamic_limits, 1):
-                per_s = math.inf if limit is None else np.asarray(limit, np.float64)
-                columns.append(_tolerant(per_s * tick_s**order, dim))
-            np.broadcast_to(0.0 if limits.first is None else limits.first, dim)
-        except ValueError as error:
-            raise ConfigError(
-                f"limits: expected one number, or {dim} as an action has: {error}"
-            ) from error
+        columns = Columns.from_spec(self._spec, dim, self._arm)
+        if self._measure is not None and len(columns.absolute) == len(columns.grippers):
+            raise _not_measurable()
 
-        low, high = columns[:2]
+        low = self._per_number("low", -math.inf if self._low is None else self._low, dim)
+        high = self._per_number("high", math.inf if self._high is None else self._high, dim)
         if any(low_i > high_i for low_i, high_i in zip(low, high, strict=True)):
             raise ConfigError(f"low and high: expected low below high, got {low} and {high}")
-        self._check_positions(limits, dim)
-        self._columns = columns
-        return self._columns
 
-    def _check_positions(self, limits: MotionLimits, dim: int) -> None:
-        """Raise `ConfigError` if a limit of positions has no effect, or would move a gripper."""
-        if limits.rest is not None and len(limits.rest) != dim:
+        turns = [rotation.columns for rotation in columns.rotations]
+        differences = {
+            "max_step": (self._max_step, 0),
+            "velocity": (limits.velocity, 1),
+            "acceleration": (limits.acceleration, 2),
+            "jerk": (limits.jerk, 3),
+        }
+        all_limits = [low, high]
+        for name, (limit, order) in differences.items():
+            per_s = self._per_number(name, math.inf if limit is None else limit, dim)
+            per_tick = [_tolerant(number * tick_s**order) for number in per_s]
+            for turn in turns:
+                strictest = min(per_tick[i] for i in turn)
+                per_tick[turn[0] : turn[-1] + 1] = [strictest] * len(turn)
+            all_limits.append(per_tick)
+        if limits.first is not None:
+            self._per_number("first", limits.first, dim)
+        self._check_positions(limits, columns)
+
+        self._columns, self._limits, self._turns = columns, all_limits, turns
+        self._numbers = [i for i in range(dim) if not any(i in turn for turn in turns)]
+        return self._limits
+
+    def _per_number(self, name: str, limit: object, dim: int) -> list[float]:
+        """Return a limit for each number of an action; raises `ConfigError` if it has another
+        number of values.
+        """
+        values = np.asarray(limit, np.float64)
+        if values.ndim > 1 or (values.ndim == 1 and len(values) != dim):
             raise ConfigError(
-                f"rest: expected {dim} numbers, as an action has, got {len(limits.rest)}"
+                f"limits: {name}: expected one number, or {dim} as an action has, got "
+                f"{values.tolist()}"
+            )
+        return np.broadcast_to(values, dim).tolist()  # type: ignore[no-any-return]
+
+    def _check_positions(self, limits: MotionLimits, columns: Columns) -> None:
+        """Raise `ConfigError` if a limit of positions has no effect, or would move a gripper."""
+        if limits.rest is not None and len(limits.rest) != columns.dim:
+            raise ConfigError(
+                f"rest: expected {columns.dim} numbers, as an action has, got {len(limits.rest)}"
             )
         rest_pose = limits.rest or ()
-        moved_grippers = [i for i in self._grippers if rest_pose and rest_pose[i] is not None]
+        moved_grippers = [i for i in columns.grippers if rest_pose and rest_pose[i] is not None]
         if moved_grippers:
             raise ConfigError(
                 f"rest: expected null for the grippers, numbers {moved_grippers}, as the motion to "
                 f"rest keeps their grasp; got {limits.rest}"
             )
-        if not self._deltas:
+        for rotation in columns.rotations:
+            numbers = [rest_pose[i] for i in rotation.columns] if rest_pose else []
+            if None in numbers and numbers.count(None) < len(numbers):
+                raise ConfigError(
+                    f"rest: expected all or none of the numbers {rotation.columns} of a rotation, "
+                    f"got {numbers}; a part of a rotation is no pose"
+                )
+        if not columns.relative:
             return
 
-        positions = ("first", "rest", "workspace_low", "workspace_high")
-        without_effect = [name for name in positions if getattr(limits, name) is not None]
+        relative = list(columns.relative)
+        without_effect = []
+        for name in ("workspace_low", "workspace_high"):
+            if getattr(limits, name) is not None:
+                without_effect.append(name)
+        if limits.rest is not None and any(limits.rest[i] is not None for i in relative):
+            without_effect.append("rest")
+        if limits.first is not None and len(columns.absolute) == len(columns.grippers):
+            without_effect.append("first")
         for name in ("low", "high"):
             bound = getattr(limits, name)
-            if bound is not None and np.isfinite(np.broadcast_to(bound, dim)[self._deltas]).any():
+            if (
+                bound is not None
+                and np.isfinite(np.broadcast_to(bound, columns.dim)[relative]).any()
+            ):
                 without_effect.append(name)
         if without_effect:
             raise ConfigError(
@@ -430,56 +510,77 @@ class Guard:
             return 1.0
         return 0.5 + 0.5 * self._ticks_with_motion / self._soft_ticks
 
+    def _sizes(self, difference: Sequence[float]) -> Iterator[tuple[int, float]]:
+        """Yield the first column of each number or rotation, and the size of its difference."""
+        for i in self._numbers:
+            yield i, abs(difference[i])
+        for turn in self._turns:
+            yield turn[0], math.hypot(*(difference[i] for i in turn))
+
+    def _check_steps(
+        self, columns: Columns, numbers: list[float], last_numbers: list[float]
+    ) -> None:
+        """Raise `InvalidAction` if an action is farther than `max_step` from the one before."""
+        if self._max_step is None:
+            return
+        steps = self._limits[2]
+        for i, size in self._sizes(columns.step(numbers, last_numbers)):
+            rounding = 2 * _ROUNDING * max(abs(numbers[i]), abs(last_numbers[i]))
+            if size > steps[i] + rounding:
+                raise InvalidAction(
+                    f"action[{i}]: expected a step of at most max_step, {steps[i]:.3g}, got "
+                    f"{numbers[i]:g} after {last_numbers[i]:g}, {size:.3g} away",
+                    cause="max_step",
+                )
+
     def _check_dynamics(
-        self, numbers: list[float], last_numbers: list[float], limits: Sequence[list[float]]
+        self, columns: Columns, numbers: list[float], last_numbers: list[float]
     ) -> None:
         """Check the speed, acceleration and jerk of this tick's motion, and record it.
 
         Args:
+            columns: The meaning of the numbers.
             numbers: The numbers of the action.
             last_numbers: The numbers of the action or pose from which the motion begins.
-            limits: The limits of velocity, acceleration and jerk of each number, per tick.
 
         Raises:
             InvalidAction: The motion exceeds a limit.
         """
-        velocity_limits, acceleration_limits, jerk_limits = limits
         zeros = [0.0] * len(numbers)
         if last_numbers == self._accepted:  # the motion continues from the last action
             last_speeds, last_changes = self._speeds, self._changes
         else:
-            last_speeds, last_changes = zeros.copy(), zeros
+            last_speeds, last_changes = columns.motion(last_numbers, last_numbers), zeros
 
-        pairs = zip(numbers, last_numbers, strict=True)
-        speeds = [number - last_number for number, last_number in pairs]
-        for i in self._deltas:
-            speeds[i] = numbers[i]
-            last_speeds[i] = last_numbers[i]
+        speeds = columns.motion(numbers, last_numbers)
         changes = [speed - last for speed, last in zip(speeds, last_speeds, strict=True)]
+        jerks = [change - last for change, last in zip(changes, last_changes, strict=True)]
 
+        velocity_limits, acceleration_limits, jerk_limits = self._limits[3:]
         share = self._softness()
-        for i, speed in enumerate(speeds):
+        for i in self._numbers:
             # A speed contains the float32 rounding error of two actions; each further difference
             # doubles the error.
+            speed, last_speed = speeds[i], last_speeds[i]
             rounding = 2 * _ROUNDING * max(abs(numbers[i]), abs(last_numbers[i]))
             limit = share * velocity_limits[i]
             if abs(speed) > limit + rounding:
                 raise self._refusal("velocity", i, speed, limit, 1)
 
-            last_speed = last_speeds[i]
             is_braking = abs(speed) <= abs(last_speed) and speed * last_speed >= 0.0
             if is_braking:
                 continue
 
-            change = changes[i]
             limit = share * acceleration_limits[i]
-            if abs(change) > limit + 2 * rounding:
-                raise self._refusal("acceleration", i, change, limit, 2)
+            if abs(changes[i]) > limit + 2 * rounding:
+                raise self._refusal("acceleration", i, changes[i], limit, 2)
 
-            jerk = change - last_changes[i]
             limit = share * jerk_limits[i]
-            if abs(jerk) > limit + 4 * rounding:
-                raise self._refusal("jerk", i, jerk, limit, 3)
+            if abs(jerks[i]) > limit + 4 * rounding:
+                raise self._refusal("jerk", i, jerks[i], limit, 3)
+
+        for turn in self._turns:
+            self._check_turn(turn, share, numbers, (last_speeds, speeds, changes, jerks))
 
         has_moved = any(speeds)
         # After a tick at rest, an earlier deceleration no longer counts.
@@ -487,6 +588,49 @@ class Guard:
         self._accepted = numbers
         self._speeds = speeds
         self._ticks_with_motion += has_moved
+
+    def _check_turn(
+        self,
+        turn: tuple[int, ...],
+        share: float,
+        numbers: list[float],
+        differences: tuple[list[float], list[float], list[float], list[float]],
+    ) -> None:
+        """Check the speed, acceleration and jerk of a rotation, whose differences are vectors.
+
+        Args:
+            turn: The columns of the rotation.
+            share: The share of the limits that applies.
+            numbers: The numbers of the action.
+            differences: The speeds of the last and this tick, the changes of the speeds, and the
+                changes of these changes.
+
+        Raises:
+            InvalidAction: The motion exceeds a limit.
+        """
+        first = turn[0]
+        last_speed, speed, change, jerk = ([of[i] for i in turn] for of in differences)
+        # The error of an angle is that of the numbers, which are at most pi or a few turns.
+        rounding = 4 * _ROUNDING * max(1.0, *(abs(numbers[i]) for i in turn))
+        size, last_size = math.hypot(*speed), math.hypot(*last_speed)
+        velocity_limits, acceleration_limits, jerk_limits = self._limits[3:]
+        limit = share * velocity_limits[first]
+        if size > limit + rounding:
+            raise self._refusal("velocity", first, size, limit, 1)
+
+        # Braking shortens the vector; only a change of its direction is limited.
+        along = sum(now * last for now, last in zip(speed, last_speed, strict=True))
+        is_braking = size <= last_size and along >= 0.0
+        if is_braking and last_size > 0.0:
+            part = along / last_size**2
+            change = [now - part * last for now, last in zip(speed, last_speed, strict=True)]
+
+        limit = share * acceleration_limits[first]
+        if math.hypot(*change) > limit + 2 * rounding:
+            raise self._refusal("acceleration", first, math.hypot(*change), limit, 2)
+        limit = share * jerk_limits[first]
+        if not is_braking and math.hypot(*jerk) > limit + 4 * rounding:
+            raise self._refusal("jerk", first, math.hypot(*jerk), limit, 3)
 
     def _refusal(
         self, quantity: str, i: int, value: float, limit: float, order: int
@@ -538,20 +682,44 @@ def measured_state(name: str | None) -> Callable[[Obs], np.ndarray] | None:
     return measure
 
 
+def _not_measurable() -> ConfigError:
+    return ConfigError(
+        "measure: expected None for relative actions, which cannot be compared with a pose, got a "
+        "function; leave it out"
+    )
+
+
 def _strictest(
-    name: str, stricter: np.ufunc, *bounds: float | np.ndarray | tuple[float, ...] | None
+    name: str,
+    stricter: np.ufunc,
+    spec: ActionSpec,
+    *bounds: float | np.ndarray | tuple[float, ...] | None,
 ) -> np.ndarray | None:
     """Return the strictest of the bounds; None if all bounds are None. The result is float32 like
     the actions, so that a bound of 0.1 accepts 0.1.
+
+    Raises:
+        ConfigError: A bound is NaN, or the bounds have different numbers of values.
     """
     arrays = [np.asarray(bound, np.float32) for bound in bounds if bound is not None]
     if any(np.isnan(array).any() for array in arrays):
         raise ConfigError(f"{name}: expected numbers, got {bounds}")
+
+    sizes = {len(array) for array in arrays if array.ndim == 1}
+    if spec.dim is not None:
+        sizes.add(spec.dim)
+    if len(sizes) > 1 or any(array.ndim > 1 for array in arrays):
+        shapes = [array.shape for array in arrays]
+        dim = "the same number" if spec.dim is None else f"{spec.dim} numbers"
+        raise ConfigError(
+            f"{name}: expected one number, or {dim} for an action, from the contract, the guard "
+            f"and the limits, got the shapes {shapes}; give one bound for each number of an action"
+        )
     return functools.reduce(stricter, arrays) if arrays else None
 
 
-def _tolerant(limit: float | np.ndarray, dim: int) -> list[float]:
-    """Return the limit of each number with a tolerance, since float32 rounds a step of 0.1 to a
-    slightly larger value.
+def _tolerant(limit: float) -> float:
+    """Return a limit with a tolerance, since float32 rounds a step of 0.1 to a slightly larger
+    value.
     """
-    return (np.broadcast_to(limit, dim) * (1 + 1e-4) + 1e-6).tolist()  # type: ignore[no-any-return]
+    return limit * (1 + 1e-4) + 1e-6

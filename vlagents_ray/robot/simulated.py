@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vlagents_ray.columns import Columns
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.interface import Act, Obs
 
@@ -23,11 +24,10 @@ class SimulatedRobot:
     """An arm whose joints follow their commands. Its cameras show the first joint as a dot on a
     still image.
 
-    Actions have the `dim` numbers of the policy's contract. They are deltas of the joints, or
-    absolute targets (also if the contract declares neither), with the grippers of
-    `ActionSpec.gripper_columns`. Observations have the cameras that the contract names, with their
-    sizes, and the parts of the state, filled with the joints; without a contract they have the
-    cameras `front` and `wrist` and the part `joints`.
+    Actions have the `dim` numbers of the policy's contract, and move the joints as its `Columns`
+    declare; numbers without a declaration are targets. Observations have the cameras that the
+    contract names, with their sizes, and the parts of the state, filled with the joints; without a
+    contract they have the cameras `front` and `wrist` and the part `joints`.
 
     Args:
         contract: The contract of the policy that drives the arm.
@@ -52,7 +52,7 @@ class SimulatedRobot:
             self._pictures[name] = np.stack(channels, -1).astype(np.uint8)
 
         self._joints = np.zeros(self._action.dim or 7, np.float32)
-        self._grippers = self._action.gripper_columns(len(self._joints))
+        self._columns = Columns.from_spec(self._action, len(self._joints))
         self._target = self._joints.copy()
         self.applied = 0  # the number of applied actions
         self.stopped = False
@@ -68,7 +68,7 @@ class SimulatedRobot:
         opened, closed = self._action.gripper_open, self._action.gripper_closed
         opening = 1.0
         if opened is not None and closed is not None and opened != closed:
-            position = float(self._joints[self._grippers].mean())
+            position = float(self._joints[list(self._columns.grippers)].mean())
             opening = min(1.0, max(0.0, (position - closed) / (opened - closed)))
 
         # A red dot moves with the first joint.
@@ -85,15 +85,13 @@ class SimulatedRobot:
         """Set the targets of the joints, rad."""
         self.applied += 1
         self.stopped = False
-        deltas = self._action.delta_columns(len(action))
-        target = action.copy()
-        target[deltas] += self._target[deltas]
-        self._target = target
+        self._target = self._columns.executed(self._target, action)
 
     def stop(self) -> None:
         """Make the current position of the joints their target; the grippers keep their grasp."""
         target = self._joints.copy()
-        target[self._grippers] = self._target[self._grippers]
+        grippers = list(self._columns.grippers)
+        target[grippers] = self._target[grippers]
         self._target = target
         self.stopped = True
 

@@ -16,6 +16,7 @@ import pytest
 from arm_models import simulated_arm
 from ros_arm import COMMANDS, JOINTS, Wire, header
 
+from vlagents_ray.columns import Columns
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import entries
 from vlagents_ray_robot import DISTRIBUTION
@@ -371,7 +372,7 @@ def test_an_arm_in_mujoco_stops_where_it_is_and_keeps_its_grasp(name: str, delta
     with closing(simulated_arm(name, cameras=(), delta=delta)) as arm:
         spec = arm.contract.action
         dim = spec.dim or 0
-        grippers = spec.gripper_columns(dim)
+        grippers = list(Columns.from_spec(spec, dim).grippers)
         action = (
             np.full(dim, 0.5, np.float32)
             if delta

@@ -259,8 +259,8 @@ def run_episodes(
             instructions.append(failures.checked_instruction(text, "reset"))
     reset_ms = 1e3 * (perf_counter() - start)
 
-    def new_executor() -> ChunkExecutor:
-        return ChunkExecutor(execute, clock, contract)
+    def new_executor(last: np.ndarray | None) -> ChunkExecutor:
+        return ChunkExecutor(execute, clock, contract, last)
 
     observers = observers or [EpisodeObserver()] * len(keys)
     episodes: list[_Episode] = []
@@ -319,16 +319,16 @@ class _Episode:
     session: Agent
     stats: EpisodeStats
     observer: EpisodeObserver
-    new_executor: Callable[[], ChunkExecutor]
+    new_executor: Callable[[np.ndarray | None], ChunkExecutor]
     obs: Obs  # the newest observation
     ticks: deque[Tick] = field(default_factory=deque)  # ticks to execute before the next request
     outcome: Outcome | None = None  # set once the episode is over
     _executor: ChunkExecutor = field(init=False)
     _width: int | None = None  # number of values in an action
-    _done: bool = False  # whether the policy ends the episode after `ticks`
+    _last: np.ndarray | None = None  # the last executed action, (D,)
 
     def __post_init__(self) -> None:
-        self._executor = self.new_executor()
+        self._executor = self.new_executor(None)
 
     def began(self, answer: dict[str, Any] | Exception, checkpoint: str | None) -> None:
         """Begin the episode, with the policy's answer to the reset of the session, unless the
@@ -352,7 +352,7 @@ class _Episode:
         """Begin a further task, and drop the remaining plan of the previous task."""
         self.stats.instructions.append(instruction)
         self.ticks.clear()
-        self._executor, self._done = self.new_executor(), False
+        self._executor = self.new_executor(self._last)
 
     def request(self) -> Obs:
         """Return the newest observation, with the entries that observer and executor add to its
@@ -384,7 +384,6 @@ class _Episode:
             )
             self.observer.add_act(answer, sum(tick.waited for tick in ticks))
             self.ticks.extend(ticks)
-            self._done = answer.done
         except VLAgentsError as error:
             self.failed(error)
 
@@ -405,7 +404,7 @@ class _Episode:
             stats.ending = "terminated"
         elif step.truncated or stats.steps >= limit:
             stats.ending = "truncated"
-        elif self._done and not self.ticks:
+        elif tick.done:
             stats.ending = "policy_done"
         else:
             is_over = False
@@ -416,6 +415,7 @@ class _Episode:
     def _executed(self) -> Tick:
         """Count the next of `ticks`, which the environment has executed, and return it."""
         tick, stats = self.ticks.popleft(), self.stats
+        self._last = tick.action
         stats.steps += 1
         stats.ticks_waited += tick.waited
         if stats.timeliness is not None:

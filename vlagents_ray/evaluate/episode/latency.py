@@ -16,11 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlagents_ray.chunking.buffer import ChunkBuffer, DelayEstimate
-from vlagents_ray.chunking.fallback import SafeAction, neutral, stopping
+from vlagents_ray.columns import Columns
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.plan.config import ClockConfig
-from vlagents_ray.interface import Obs
 
 _SYNCHRONOUS = ClockConfig(latency=0)
 # Tolerance in ticks: 1.1 s at 10 Hz are 11 ticks, although 1.1 * 10 > 11 in floating point.
@@ -35,18 +34,27 @@ class Tick(NamedTuple):
     starved: bool = False  # whether the action is not a row of an answer
     # Real-time mode: the time since the observation from which the action was computed, ms.
     age_ms: float | None = None
+    # Whether the policy ends the episode after this tick, the last row of an answer with `done`.
+    done: bool = False
 
 
 class ChunkExecutor:
     """Chooses the actions that are executed between two requests, in one episode."""
 
-    def __init__(self, execute: int | None, clock: ClockConfig | None, env: Contract) -> None:
-        """Begin an episode.
+    def __init__(
+        self,
+        execute: int | None,
+        clock: ClockConfig | None,
+        env: Contract,
+        last: np.ndarray | None = None,
+    ) -> None:
+        """Begin an episode, or a further task of it.
 
         Args:
             execute: Number of rows of a chunk to execute before the next request; None: all.
             clock: The real-time mode; None: the environment waits for the policy.
             env: The contract of the environment.
+            last: The last action of the task before, (D,), whose targets are kept.
 
         Raises:
             ConfigError: The rate of the clock, or the action that holds the robot before the first
@@ -63,21 +71,17 @@ class ChunkExecutor:
             )
 
         self._spec = env.action
-        self._still: str = self._clock.meanwhile
-        if self._still == "chunk":
-            self._still = stopping(env.action)
-
-        needs_neutral = self._clock.latency != 0 and stopping(env.action) != "zero"
-        if needs_neutral and self._clock.neutral is None:
-            raise ConfigError(
-                "clock: expected clock.neutral, the action before the first answer, or an env "
-                "whose contract declares relative actions, got neither; give clock.neutral, as "
-                "zeros might command a motion to a pose"
-            )
+        if self._clock.latency != 0 and last is None and self._clock.neutral is None:
+            dim = env.action.dim
+            if dim is None and not env.action.relative:
+                raise _needs_neutral()
+            if dim is not None:
+                self._first_still(dim)
 
         self._plan = ChunkBuffer()
         self._tick = 0  # the number of the next tick in real-time mode
-        self._last: np.ndarray | None = None  # the last action, (D,)
+        self._last = last  # the last action, (D,)
+        self._answered = False  # whether a row of an answer was executed
         self._delay = DelayEstimate()
 
     def latency_s(self, measured_s: float) -> float | None:
@@ -103,14 +107,18 @@ class ChunkExecutor:
         """Return the ticks until the next request, given an answer with the rows `rows`, (H, D),
         the latency `latency_s` and the info `info`.
 
-        If the answer has `done`, no request follows, and all its rows are executed.
+        If the answer has `done`, all its rows are executed, and the episode ends with the last one.
+        If the answer is too late to execute any row, it does not end the episode.
 
         Raises:
             ConfigError: No row is left for real-time chunking.
         """
         execute = None if done else self._execute
         if not self._real_time:
-            yield from map(Tick, rows[:execute])
+            executed_rows = rows[:execute]
+            for row in executed_rows[:-1]:
+                yield Tick(row)
+            yield Tick(executed_rows[-1], done=done)
             return
         if self._clock.real_time_chunking and not done and len(rows) <= (execute or len(rows)):
             raise ConfigError(
@@ -134,10 +142,12 @@ class ChunkExecutor:
         start = max(executed_at_request, latest_start)
         self._plan.replace(rows, start if self._clock.align else None, observed)
         first = self._plan.take()
-        yield self._executed(first.action, observed)
-        for action in rows[first.row + 1 : execute]:
-            self._plan.advance()
+        self._answered = True
+        remaining = [first.action, *rows[first.row + 1 : execute]]
+        for action in remaining[:-1]:
             yield self._executed(action, observed)
+            self._plan.advance()
+        yield self._executed(remaining[-1], observed)._replace(done=done)
 
     def _waiting(self, ticks: int, dim: int) -> Iterator[Tick]:
         for _ in range(ticks):
@@ -145,8 +155,8 @@ class ChunkExecutor:
             if step is None:
                 action = self._held(dim)
                 # A repeated relative action moves the robot further, so that the plan advances.
-                repeats = self._clock.meanwhile == "hold" and self._plan.executed > 0
-                if repeats and stopping(self._spec) == "zero":
+                repeats = self._clock.meanwhile == "hold" and self._answered
+                if repeats and Columns.from_spec(self._spec, dim).relative:
                     self._plan.advance()
                 yield self._executed(action, None, waited=True)
             else:
@@ -169,21 +179,43 @@ class ChunkExecutor:
 
     def _held(self, dim: int) -> np.ndarray:
         """Return the action of a tick for which no row remains, (D,)."""
-        configured = self._clock.neutral
-        if configured is None:
-            still = neutral(self._spec, dim)
-        else:
-            still = np.asarray(configured, np.float32)
-        if still.shape != (dim,):
-            raise ConfigError(
-                f"clock.neutral: expected {dim} numbers, as the policy's actions have, got "
-                f"{len(still)}"
-            )
+        columns = Columns.from_spec(self._spec, dim)
+        configured = None
+        if self._clock.neutral is not None:
+            configured = np.asarray(self._clock.neutral, np.float32)
+            if configured.shape != (dim,):
+                raise ConfigError(
+                    f"clock.neutral: expected {dim} numbers, as the policy's actions have, got "
+                    f"{len(configured)}"
+                )
 
-        if self._last is None:
-            return still
-        if self._still == "hold":
-            return self._last
-        if configured is not None:
-            return still
-        return SafeAction("zero", self._spec)(Obs(), self._last)
+        last = self._last
+        if last is None:
+            return self._first_still(dim) if configured is None else configured
+        if self._clock.meanwhile == "hold" and self._answered:
+            return last
+        if self._clock.meanwhile == "zero" and configured is not None:
+            grippers = list(columns.grippers)
+            configured[grippers] = last[grippers]
+            return configured
+        return columns.still(last)
+
+    def _first_still(self, dim: int) -> np.ndarray:
+        """Return the action before the first answer, (D,): no motion, with open grippers, as
+        environments begin their episodes.
+
+        Raises:
+            ConfigError: The contract does not declare the value of a target or an open gripper.
+        """
+        still = Columns.from_spec(self._spec, dim).first_still(1.0)
+        if still is None:
+            raise _needs_neutral()
+        return still
+
+
+def _needs_neutral() -> ConfigError:
+    return ConfigError(
+        "clock: expected clock.neutral, the action before the first answer, or an env whose "
+        "contract declares relative actions and the value of an open gripper, got neither; give "
+        "clock.neutral, as zeros might command a motion to a pose"
+    )

@@ -239,8 +239,8 @@ class ClockConfig(_PlanModel):
     )
     neutral: list[FiniteFloat] | None = Field(
         default=None,
-        description="Action before the first answer, and of `zero`. null: zeros, with the gripper "
-        "open at first.",
+        description="Action before the first answer, and of `zero`, which keeps the gripper. null: "
+        "no motion, with the gripper open at first.",
     )
 
 

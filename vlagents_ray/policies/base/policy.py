@@ -422,12 +422,14 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         """Begin an episode in this session."""
         # Numpy accepts no negative seed. Modulo 2**64, distinct int64 values remain distinct.
         seeds = [self.config.seed, seed % 2**64]
+        contract = self.contract
+        action = None if contract is None else contract.action
         self.episode = PolicyEpisode(
             instruction,
             deque(maxlen=self.history),
             np.random.default_rng(seeds),
             np.random.default_rng([*seeds, 1]),
-            ChunkBuffer(ENSEMBLE, self.config.ensemble_m),
+            ChunkBuffer(ENSEMBLE, self.config.ensemble_m, action),
         )
 
     def _current_episode(self) -> PolicyEpisode:
