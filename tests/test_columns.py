@@ -334,6 +334,9 @@ BASE = ActionSpec(names=("shoulder.pos", "x.vel", "gripper.pos"))
         (ActionSpec(space="joint_velocity", absolute=(0,)), ARM, (2,), (1,)),
         (ActionSpec(names=("Left_Gripper", "a", "b"), gripper_open=1.0), None, (0,), ()),
         (ActionSpec(names=("a", "b"), gripper_open=1.0), None, (2,), ()),
+        (ActionSpec(delta=False), ActionSpec(grippers=(0,)), (0,), ()),
+        (ActionSpec(delta=True, gripper_open=1.0), ActionSpec(grippers=(0,)), (0, 2), (1,)),
+        (ActionSpec(names=("a", "gripper", "b"), grippers=()), None, (), ()),
     ],
 )
 def test_policy_and_arm_declare_grippers_and_motions_together(
@@ -370,6 +373,7 @@ def test_the_opening_of_a_gripper_is_between_the_ends_of_either_contract() -> No
         (ActionSpec(absolute=(1,)), 3, "delta=True"),
         (ActionSpec(delta=True, absolute=(3,)), 3, "from 0 to 2"),
         (ActionSpec(delta=True, absolute=(-1,)), 3, "from 0 to 2"),
+        (ActionSpec(grippers=(3,)), 3, "grippers: expected columns from 0 to 2"),
         (ActionSpec(delta=True, absolute=(4,), rotation="axis_angle"), 7, "a target or a motion"),
         (ActionSpec(rotation_columns=(3,)), 7, "`rotation`"),
         (ActionSpec(rotation="none", rotation_columns=(3,)), 7, "`rotation`"),

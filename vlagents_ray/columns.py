@@ -378,6 +378,12 @@ def _require_consistent(spec: ActionSpec, dim: int) -> None:
             f"action.rotation: expected 'axis_angle' or 'euler_xyz' for velocities, got "
             f"{spec.rotation!r}, which has no rate; declare the rotation of the velocities"
         )
+    outside = [column for column in spec.grippers or () if not 0 <= column < dim]
+    if outside:
+        raise ConfigError(
+            f"action.grippers: expected columns from 0 to {dim - 1}, got {outside}; correct "
+            "`grippers` or `dim` of the contract"
+        )
     opened, closed = spec.gripper_open, spec.gripper_closed
     if opened is not None and opened == closed:
         raise ConfigError(
@@ -389,9 +395,13 @@ def _require_consistent(spec: ActionSpec, dim: int) -> None:
 def _grippers(spec: ActionSpec, dim: int) -> Iterator[int]:
     """Yield the columns of the grippers that a contract declares.
 
-    These are the columns with "gripper" in their names. Without names, they are the last columns of
-    each arm's part, if the contract declares the value of an open or a closed gripper.
+    These are its `grippers`, or else the columns with "gripper" in their names. Without names, they
+    are the last columns of each arm's part, if the contract declares the value of an open or a
+    closed gripper.
     """
+    if spec.grippers is not None:
+        yield from spec.grippers
+        return
     named = list(_named(spec, dim, _is_gripper))
     if named:
         yield from named

@@ -26,7 +26,7 @@ _MAX_STATE_PARTS = 12
 _SHOWN_COMBINATIONS = 3  # largest number of combinations that a message lists
 
 # Fields of an action that only few contracts declare.
-_OMITTED_IF_NONE = ("absolute", "rotation_columns", "names")
+_OMITTED_IF_NONE = ("absolute", "grippers", "rotation_columns", "names")
 Rotation = Literal["none", "axis_angle", "euler_xyz", "quat_xyzw", "quat_wxyz", "rot6d"]
 
 
@@ -73,6 +73,9 @@ class ActionSpec:
     # Columns, from 0, that are targets although `delta` is True, such as a waist beside an arm. The
     # grippers, which are always targets, need not be among them.
     absolute: tuple[int, ...] | None = None
+    # Columns of the grippers; None: the columns with "gripper" in their names, or else the last
+    # column of each arm, if `gripper_open` or `gripper_closed` is set.
+    grippers: tuple[int, ...] | None = None
     # First column of each rotation; None: the column after the position, x, y, z, of each arm.
     rotation_columns: tuple[int, ...] | None = None
 
@@ -179,7 +182,7 @@ class Contract:
             action = closed(ActionSpec, values["action"], "contract.action")
             action["arms"] = _names(action.get("arms"), "contract.action.arms")
             action["names"] = _names(action.get("names"), "contract.action.names")
-            for name in ("absolute", "rotation_columns"):
+            for name in ("absolute", "grippers", "rotation_columns"):
                 action[name] = _indices(action.get(name), f"contract.action.{name}")
             values["action"] = ActionSpec(**action)
         return cls(**values)
@@ -417,6 +420,7 @@ _ACTION_CURES = {
     "rotation": "convert the rotation, or choose another control mode",
     "rotation_columns": "put the rotations into the env's order",
     "frame": "choose the control mode of that frame",
+    "grippers": "put the grippers into the env's order",
     "gripper_open": "map the gripper's command",
     "gripper_closed": "map the gripper's command",
     "arms": "put the arms' commands into the env's order",

@@ -90,7 +90,7 @@ _ALOHA = RobotConvention(
     },
     {"state": {"left/joints": 6, "left/gripper": 1, "right/joints": 6, "right/gripper": 1}},
     "chw",
-    ActionSpec(dim=14, arms=("left", "right")),
+    ActionSpec(dim=14, gripper_open=1.0, gripper_closed=0.0, arms=("left", "right")),
     optional=("images.cam_left_wrist", "images.cam_right_wrist"),
 )
 

@@ -180,3 +180,39 @@ def test_a_file_that_cannot_be_read_is_an_error_that_names_it(mistake: str, tmp_
 def test_a_missing_file_is_an_error_that_names_it(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"missing\.yaml"):
         read_settings(tmp_path / "missing.yaml")
+
+
+NUMBERS, STATE = "std_msgs/msg/Float64MultiArray", "sensor_msgs/msg/JointState"
+FINGERS = {
+    "gripper": {"topic": "/joint_states", "names": ["finger"], "open": 0.04, "closed": 0.0},
+    "state": {"joints": {"topic": "/joint_states", "names": ["a", "finger"]}},
+}
+NAMED = {"topic": "/arm", "type": STATE, "names": ["a", "Robotiq_Gripper"]}
+ONE = {"topic": "/arm/gripper/commands", "type": NUMBERS, "numbers": 1}
+
+
+@pytest.mark.parametrize(
+    ("change", "actions", "grippers"),
+    [
+        ({}, [{"topic": "/arm", "type": NUMBERS, "numbers": 2, "stop": "joints"}], []),
+        (FINGERS, [{"topic": "/arm", "type": NUMBERS, "numbers": 2, "stop": "joints"}], [1]),
+        (
+            FINGERS,
+            [{"topic": "/t", "type": STATE, "names": ["finger", "a"], "stop": "joints"}],
+            [0],
+        ),
+        ({}, [{**NAMED, "stop": "joints"}], [1]),
+        ({}, [{**NAMED, "stop": "zeros"}], []),  # velocities
+        ({}, [{**NAMED, "stop": "joints", "grippers": [0]}], [0]),
+        ({}, [{**NAMED, "stop": "joints"}, {**ONE, "stop": "nothing"}], [1, 2]),
+        ({}, [{**ONE, "stop": "zeros"}], []),
+        # One of several numbers may be the gripper's, but which one is not known.
+        ({}, [{**ONE, "numbers": 2, "stop": "joints"}], []),
+        ({}, [{**ONE, "numbers": 2, "stop": "joints", "grippers": [1]}], [1]),
+    ],
+)
+def test_grippers_are_found_by_their_names_among_all_topics(
+    change: dict[str, Any], actions: list[dict[str, Any]], grippers: list[int]
+) -> None:
+    settings = settings_from({**ARM, **change, "actions": actions}, "arm.yaml")
+    assert settings.grippers == grippers

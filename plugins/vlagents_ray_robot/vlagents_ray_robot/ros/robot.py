@@ -73,8 +73,8 @@ class ActionTopic:
     values: Values = "position"  # the field of a JointState
     fields: tuple[str, ...] = TWIST  # the fields of a Twist
     reach_s: float = 0.1  # the time in which the arm should reach the point of a JointTrajectory
-    # The indices of the grippers among the topic's numbers; None for the joints of the gripper's
-    # topic.
+    # The indices of the grippers among the topic's numbers; None finds them by name, see
+    # `RosSettings.grippers_of`.
     grippers: tuple[int, ...] | None = None
 
     @property
@@ -135,10 +135,13 @@ class RosSettings:
         stops = {command.stop for command in self.actions} - {NOTHING}
         return False if stops and stops <= self.state.keys() else None
 
-    def gripper_columns(self, command: ActionTopic) -> list[int]:
+    def grippers_of(self, command: ActionTopic) -> list[int]:
         """Return the indices of the grippers among the numbers of a topic.
 
-        Without a setting, these are the joints that the topic of the gripper names.
+        Without a setting, these are the joints that the topic of the gripper names, the joints
+        whose names contain "gripper", and the only number of a topic whose name contains "gripper".
+        Numbers that zeros stop are velocities or deltas, of which only the joints of the gripper's
+        topic are known to be a position.
         """
         if command.grippers is not None:
             return list(command.grippers)
@@ -148,7 +151,25 @@ class RosSettings:
         if not names and measured is not None:
             names = measured.names
         fingers = () if self.gripper is None else self.gripper.names
-        return [index for index, name in enumerate(names) if name in fingers]
+        by_name = command.stop != ZEROS
+        if not names and by_name and command.dim == 1 and "gripper" in command.topic.lower():
+            return [0]
+
+        grippers = []
+        for index, name in enumerate(names):
+            if name in fingers or (by_name and "gripper" in name.lower()):
+                grippers.append(index)
+        return grippers
+
+    @property
+    def grippers(self) -> list[int]:
+        """The indices of all grippers in an action."""
+        grippers = []
+        first = 0
+        for command in self.actions:
+            grippers += [first + index for index in self.grippers_of(command)]
+            first += command.dim
+        return grippers
 
 
 def read_settings(file: Path | str) -> RosSettings:
@@ -564,7 +585,11 @@ class RosRobot:
             cameras={name: CameraSpec(*image.shape[:2]) for name, image in images.items()},
             state={name: StateSpec(len(vector)) for name, vector in state.items()},
             gripper=self.settings.gripper is not None,
-            action=ActionSpec(dim=self.settings.dim, delta=self.settings.delta),
+            action=ActionSpec(
+                dim=self.settings.dim,
+                delta=self.settings.delta,
+                grippers=tuple(self.settings.grippers),
+            ),
         )
 
     def observe(self) -> Obs:
@@ -614,7 +639,7 @@ class RosRobot:
             if command.stop == NOTHING:
                 continue
 
-            grippers = self.settings.gripper_columns(command)
+            grippers = self.settings.grippers_of(command)
             if command.stop in ("", ZEROS):
                 row = np.zeros(command.dim, np.float32)
                 row[grippers] = self._measured_opening()
