@@ -671,6 +671,8 @@ def _from_vector(vector: Sequence[float]) -> _Quaternion:
 
 def _turn(kind: Rotation, before: Sequence[float], after: Sequence[float]) -> list[float]:
     """Return the rotation vector, rad, about fixed axes from one rotation to another."""
+    if tuple(before) == tuple(after):  # exactly none, without rounding
+        return [0.0, 0.0, 0.0]
     return _vector(_product(_read(kind, after), _inverse(_read(kind, before))))
 
 

@@ -187,7 +187,14 @@ def _action_spec(dim: int, *, absolute: bool) -> ActionSpec:
     """
     if not absolute or dim % _POSE_NUMBERS:
         return ActionSpec(dim=dim)
-    return ActionSpec(dim=dim, space="ee_pose", delta=False, rotation="rot6d", frame="base")
+    return ActionSpec(
+        dim=dim,
+        space="ee_pose",
+        delta=False,
+        rotation="rot6d",
+        rotation_columns=tuple(range(3, dim, _POSE_NUMBERS)),
+        frame="base",
+    )
 
 
 OBS = "obs"  # name of the only input of a policy without cameras

@@ -8,7 +8,7 @@ import json
 import os
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.contract import ActionSpec, Contract, Rotation, StateSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
@@ -44,7 +44,8 @@ CONFIG, STATISTICS = "processor_config.json", "statistics.json"
 # Relative representation of actions -> whether decoded actions are deltas.
 _RELATIVE = {"RELATIVE": False, "DELTA": True}
 _SPACES = {"NON_EEF": "joint", "EEF": "ee_pose"}
-_ROTATIONS = {"XYZ_ROT6D": "rot6d", "XYZ_ROTVEC": "axis_angle"}
+_ROTATIONS: Mapping[str, Rotation] = {"XYZ_ROT6D": "rot6d", "XYZ_ROTVEC": "axis_angle"}
+_POSITION = 3  # numbers of a position, which precede a rotation
 _CURE = "save the checkpoint's processor with its dataset's statistics, as GR00T's training does"
 
 
@@ -98,7 +99,7 @@ class Embodiment:
 
         action_spec = _action_spec(
             config["action"].get("action_configs") or (),
-            sum(widths["action"].values()),
+            list(widths["action"].values()),
             converts=bool(settings.get("use_relative_action")),
         )
         return cls(
@@ -202,30 +203,50 @@ def _bounds(
     return dict(zip(bound_names, (lower.tolist(), upper.tolist()), strict=True))
 
 
-def _action_spec(groups: Any, dim: int, *, converts: bool) -> ActionSpec:
-    """Describe the actions from their relative groups.
+def _action_spec(
+    groups: Sequence[Mapping[str, Any]], widths: Sequence[int], *, converts: bool
+) -> ActionSpec:
+    """Describe the columns of the actions, if the checkpoint declares relative groups.
 
-    Checkpoints call all other groups absolute, even displacements such as LIBERO's, so the contract
-    does not describe these groups.
+    A checkpoint without relative groups calls even displacements absolute, such as LIBERO's, so
+    the contract does not describe its actions.
 
     Args:
         groups: The checkpoint's description of each group.
-        dim: The number of values of an action.
+        widths: The number of values of each group.
         converts: Whether GR00T converts relative groups to absolute ones, which it does if the
             processor has `use_relative_action`.
     """
+    undescribed = ActionSpec(dim=sum(widths))
     relative = [group for group in groups if converts and group["rep"] in _RELATIVE]
-    fields: dict[str, tuple[Mapping[str, Any], str]] = {
-        "delta": (_RELATIVE, "rep"),
-        "space": (_SPACES, "type"),
-        "rotation": (_ROTATIONS, "format"),
-    }
-    facts: dict[str, Any] = {}
-    for field_name, (meanings, key) in fields.items():
-        values = {meanings.get(group[key]) for group in relative}
-        if len(values) == 1:  # an `ActionSpec` has one value for all groups
-            facts[field_name] = values.pop()
-    return ActionSpec(dim=dim, **facts)
+    if not relative or len(groups) != len(widths):
+        return undescribed
+
+    targets: list[int] = []
+    rotation_columns: list[int] = []
+    rotations: set[Rotation] = set()
+    start = 0
+    for group, width in zip(groups, widths, strict=True):
+        if not _RELATIVE.get(group["rep"]):
+            targets += range(start, start + width)
+        rotation = _ROTATIONS.get(group["format"]) if group["type"] == "EEF" else None
+        if rotation is not None:
+            rotations.add(rotation)
+            rotation_columns.append(start + _POSITION)
+        start += width
+    if len(rotations) > 1:  # an `ActionSpec` has one representation for all rotations
+        return undescribed
+
+    has_deltas = len(targets) < start
+    spaces = {_SPACES.get(group["type"]) for group in relative}
+    return replace(
+        undescribed,
+        delta=has_deltas,
+        absolute=tuple(targets) if has_deltas and targets else None,
+        space=spaces.pop() if len(spaces) == 1 else None,
+        rotation=rotations.pop() if rotations else None,
+        rotation_columns=tuple(rotation_columns) if rotation_columns else None,
+    )
 
 
 class Gr00tConfig(ModelConfig):
