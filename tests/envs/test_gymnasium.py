@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import gymnasium
@@ -98,8 +99,14 @@ def _registered() -> Any:
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("gymnasium/Pendulum-v1", {"width": 64, "height": 48, "remake": True}),
-        ("gymnasium/MountainCarContinuous-v0", {"max_steps": 20, "unit_actions": True}),
+        (
+            "gymnasium/Pendulum-v1",
+            {"width": 64, "height": 48, "remake": True, "success": "terminated"},
+        ),
+        (
+            "gymnasium/MountainCarContinuous-v0",
+            {"max_steps": 20, "unit_actions": True, "success": "terminated"},
+        ),
         (PUSHT, {"max_steps": 20}),
         (
             "gymnasium/VlaArm-v0",
@@ -169,7 +176,7 @@ def test_unit_actions_are_scaled_to_the_box_and_clipped() -> None:
 
 @pytest.mark.parametrize(
     ("options", "solved"),
-    [({"success": "task/solved"}, True), ({"success": "terminated"}, True), ({}, False)],
+    [({"success": "task/solved"}, True), ({"success": "terminated"}, True)],
 )
 def test_success_comes_from_where_the_option_says(options: dict[str, str], solved: bool) -> None:
     with make_env("gymnasium/VlaArm-v0", **options) as env:
@@ -177,6 +184,54 @@ def test_success_comes_from_where_the_option_says(options: dict[str, str], solve
         assert [env.step(Act(np.zeros(2, np.float32)))[-1]["success"] for _ in range(3)][
             -1
         ] is solved
+
+
+def test_an_episode_without_a_word_of_success_is_an_error_at_its_end() -> None:
+    cure = r"'is_success' or 'success' in the info .* with \['task'\]; set `success` in env_options"
+    for max_steps in (10, 2):  # the simulator ends the episode, or the step limit does
+        with make_env("gymnasium/VlaArm-v0", max_steps=max_steps) as env:
+            env.reset(seed=0)
+            for _ in range(min(3, max_steps) - 1):
+                env.step(Act(np.zeros(2, np.float32)))
+            with pytest.raises(ConfigError, match=cure):
+                env.step(Act(np.zeros(2, np.float32)))
+    with pytest.raises(ConfigError, match=cure):
+        check_env(make_env("gymnasium/VlaArm-v0"))
+    with pytest.raises(ConfigError, match="expected 'is_success' or 'success'"):
+        check_env(make_env("gymnasium/MountainCarContinuous-v0", max_steps=20))
+
+
+@pytest.mark.parametrize("key", ["is_success", "success"])
+@pytest.mark.parametrize("value", [True, False, 1, 0.0, np.float32(1), np.array([False])])
+@pytest.mark.parametrize("at", ["each", "last"])
+def test_success_may_be_in_one_info_of_an_episode(
+    key: str, value: Any, at: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with make_env("gymnasium/VlaArm-v0") as env:
+        real = Arm.step
+
+        def step(arm: Arm, action: np.ndarray) -> Any:
+            *outputs, info = real(arm, action)
+            return *outputs, info | ({key: value} if at == "each" or arm.count == 3 else {})
+
+        monkeypatch.setattr(Arm, "step", step)
+        env.reset(seed=0)
+        for _ in range(3):
+            *_, info = env.step(Act(np.zeros(2, np.float32)))
+        assert info["success"] is bool(value)
+
+
+@pytest.mark.parametrize("value", [0.7, 2, "no", None, np.array([True, False]), float("nan")])
+def test_a_score_or_a_text_is_no_success(value: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = Arm.step
+    monkeypatch.setattr(
+        Arm, "step", lambda arm, act: (*real(arm, act)[:4], {"success": value, "won": value})
+    )
+    for options in ({}, {"success": "won"}):
+        with make_env("gymnasium/VlaArm-v0", **options) as env:
+            env.reset(seed=0)
+            with pytest.raises(ConfigError, match="expected a bool in the info"):
+                env.step(Act(np.zeros(2, np.float32)))
 
 
 @pytest.mark.parametrize(
@@ -217,7 +272,13 @@ def test_an_env_without_step_limit_asks_for_one() -> None:
         ("no_such_module/Env-v0", {}, MissingDependency, "no_such_module"),
         ("VlaArm-v0", {"kwargs": {"colour": 1}}, ConfigError, "colour"),
         ("VlaArm-v0", {"state": {"joints": "robot/joints"}}, ConfigError, "qpos"),
-        ("VlaArm-v0", {"state": {"joints": "robot/qpos[7:9]"}}, ConfigError, "empty"),
+        ("VlaArm-v0", {"state": {"joints": "robot/qpos[7:9]"}}, ConfigError, "4 numbers"),
+        ("VlaArm-v0", {"state": {"joints": "robot/qpos[0:9]"}}, ConfigError, "4 numbers"),
+        ("VlaArm-v0", {"state": {"joints": "robot/qpos[3:3]"}}, ConfigError, "empty"),
+        ("VlaArm-v0", {"cameras": {"front": "images/top[0:3]"}}, ConfigError, "no range"),
+        ("VlaArm-v0", {"success": "task/solved[0:1]"}, ConfigError, "no range"),
+        ("FetchReach-v4", {"control_hz": 1.0}, ConfigError, "control_hz: expected 25"),
+        ("gym_pusht/PushT-v0", {"control_hz": 50.0}, ConfigError, "control_hz: expected 10"),
         ("VlaArm-v0", {"state": {"joints": "robot[a]"}}, ConfigError, "range"),
         ("VlaArm-v0", {"cameras": {"front": "robot/qpos"}}, ConfigError, "uint8"),
         ("VlaArm-v0", {"gripper": "robot/qpos"}, ConfigError, "expected one number"),
@@ -291,6 +352,25 @@ def test_a_pick_of_a_scalar_is_a_vector_of_one() -> None:
     assert Pick.parse("").vector(np.arange(3)).tolist() == [0.0, 1.0, 2.0]
     with pytest.raises(ConfigError, match="shape"):
         Pick.parse("").vector(np.zeros((2, 2)))
+
+
+def test_a_range_has_all_the_numbers_that_it_names() -> None:
+    for size in range(1, 5):
+        vector = np.arange(size, dtype=np.float32)
+        ends = (None, *range(-6, 7))
+        for start, stop in itertools.product(ends, ends):
+            names = ["" if end is None else str(end) for end in (start, stop)]
+            pick = Pick.parse(f"[{names[0]}:{names[1]}]")
+            # The numbers of the range, as they would be of an endless vector on both sides.
+            first, last = (
+                default if end is None else end + size * (end < 0)
+                for end, default in ((start, 0), (stop, size))
+            )
+            if 0 <= first < last <= size:
+                assert pick.vector(vector).tolist() == list(range(first, last))
+            else:
+                with pytest.raises(ConfigError):
+                    pick.vector(vector)
 
 
 def test_images_are_stretched_and_there_is_no_more_info_than_the_envs() -> None:

@@ -106,9 +106,9 @@ _FETCH = BenchmarkProtocol(
 class Gymnasium(EvalEnv):
     """A Gymnasium environment with a continuous action vector, Box (D,).
 
-    Actions are clipped to the Box. Success is `info["is_success"]` or `info["success"]` if the
-    environment returns one. If it returns neither and the option `success` is not set, no episode
-    succeeds, and only the returns are meaningful.
+    Actions are clipped to the Box. Success is `info["is_success"]` or `info["success"]`. If an
+    episode ends without either, the last `step` raises `ConfigError`: the option `success` must
+    then be set.
     """
 
     def __init__(
@@ -143,9 +143,10 @@ class Gymnasium(EvalEnv):
             gripper: The path of a number in the observation.
             gripper_range: The values of the gripper's number when the gripper is closed and when it
                 is open.
-            success: The path of a bool in the step's info, or "terminated".
+            success: The path of a bool in the step's info, or "terminated"; by default, one of
+                `SUCCESS_KEYS`.
             instruction: The task in words.
-            control_hz: The rate of the steps, Hz.
+            control_hz: The rate of the steps, Hz; only for an id whose rate is not known.
             unit_actions: Whether actions are in [-1, 1] and are scaled to the Box.
             width: The width to which every image is stretched, pixels.
             height: The height to which every image is stretched, pixels.
@@ -176,6 +177,14 @@ class Gymnasium(EvalEnv):
         self._size = (height, width)
         self._ready = False
         self._steps = 0
+        self._has_success = False  # whether a step of the episode has reported success or failure
+        if defaults.control_hz and control_hz not in (None, defaults.control_hz):
+            raise ConfigError(
+                f"{self._name}: control_hz: expected {defaults.control_hz:g}, the rate of its "
+                f"steps, got {control_hz:g}; leave it out"
+            )
+        if success is not None:
+            _require_whole(Pick.parse(success))
         self._env = self._make(max_steps)
 
         try:
@@ -194,6 +203,8 @@ class Gymnasium(EvalEnv):
             if cameras is None:
                 cameras = defaults.cameras
             self._cameras = _picks(cameras if cameras is not None else space_cameras)
+            for pick in self._cameras.values():
+                _require_whole(pick)
             self._state = _picks(state if state is not None else space_state)
 
             self._gripper = Pick.parse(gripper) if gripper is not None else None
@@ -269,7 +280,7 @@ class Gymnasium(EvalEnv):
             self._call("close")
             self._env = self._make(self.max_steps)
         nested, info = self._call("reset", seed=seed, options=dict(options) if options else None)
-        self._ready, self._steps = True, 0
+        self._ready, self._steps, self._has_success = True, 0, False
         return self._observe(nested), plain(info)
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
@@ -288,6 +299,13 @@ class Gymnasium(EvalEnv):
 
         success = self._is_success(terminated, info)
         is_truncated = bool(truncated) or self._steps >= self.max_steps
+        if (terminated or is_truncated) and not self._has_success:
+            raise ConfigError(
+                f"{self._name}: expected {' or '.join(map(repr, SUCCESS_KEYS))} in the info of a "
+                f"step, got an episode of {self._steps} steps without either, the last one with "
+                f"{sorted(map(str, info))}; set `success` in env_options (--env-set) to the path "
+                "of a bool in the info, or to 'terminated'"
+            )
         # Render images even if they are not used, since rendering changes the state of some envs,
         # such as the target in the Fetch tasks.
         obs = self._observe(nested)
@@ -297,10 +315,26 @@ class Gymnasium(EvalEnv):
     def _is_success(self, terminated: Any, info: Mapping[str, Any]) -> bool:
         """Return whether the task is solved after a step."""
         if self._success == "terminated":
-            return bool(terminated)
-        if self._success is not None:
-            return bool(Pick.parse(self._success).value(info))
-        return any(bool(info.get(key, False)) for key in SUCCESS_KEYS)
+            values = [terminated]
+        elif self._success is not None:
+            values = [Pick.parse(self._success).value(info)]
+        else:
+            values = [info[key] for key in SUCCESS_KEYS if key in info]
+
+        self._has_success = self._has_success or bool(values)
+        return any(self._truth(value) for value in values)
+
+    def _truth(self, value: Any) -> bool:
+        """Return a reported success as a bool; 0 and 1 are accepted, but a score or a text is
+        not.
+        """
+        array = np.asarray(value)
+        if array.size != 1 or array.dtype.kind not in "biuf" or array.item() not in (0, 1):
+            raise ConfigError(
+                f"{self._name}: success: expected a bool in the info of a step, got {value!r}; set "
+                "`success` in env_options to the path of another value, or to 'terminated'"
+            )
+        return bool(array.item())
 
     def close(self) -> None:
         """Close the environment; safe to call twice."""
@@ -430,6 +464,15 @@ class PushT(Gymnasium):
         return obs
 
 
+def _require_whole(pick: Pick) -> None:
+    """Raise `ConfigError` if a range is given for a value that is used as a whole."""
+    if pick.range != slice(None):
+        raise ConfigError(
+            f"path {pick.text!r}: expected no range, as an image or success has no numbers to "
+            "choose from, got one; leave it out"
+        )
+
+
 def _picks(paths: Mapping[str, str]) -> dict[str, Pick]:
     return {name: Pick.parse(path) for name, path in paths.items()}
 
@@ -487,6 +530,13 @@ class Pick:
                 "another path"
             )
         numbers: np.ndarray = np.atleast_1d(array)[self.range]
+        # Python cuts a range to the numbers that there are.
+        ends = [end for end in (self.range.start, self.range.stop) if end is not None]
+        if any(not -array.size <= end <= array.size for end in ends):
+            raise ConfigError(
+                f"path {self.text!r}: expected a range within the {array.size} numbers of the "
+                "value, got a longer one; correct it"
+            )
         if numbers.size == 0:
             raise ConfigError(
                 f"path {self.text!r}: the range is empty, the value has {array.size} numbers"
