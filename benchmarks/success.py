@@ -29,7 +29,13 @@ from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError, MissingDependency, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SuiteConfig, evaluate
 from vlagents_ray.evaluate.plan.config import ClockConfig
-from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm, wilson
+from vlagents_ray.evaluate.results.statistics import (
+    Pairs,
+    difference_interval,
+    holm,
+    mcnemar,
+    wilson,
+)
 from vlagents_ray.images.codecs import ImageCodec
 from vlagents_ray.interface import Agent
 from vlagents_ray.naming import plain
@@ -49,8 +55,7 @@ APP = "reference"
 CHUNK, EXECUTE = 8, 4  # number of rows of a chunk, and number of executed rows
 TOGETHER = 16  # number of episodes of a batch
 QUALITIES = (30, 50, 70, 85, 95)  # qualities of JPEG; 85 is the client's default
-DELAYS = (0.0, 0.05, 0.15)  # delays of an answer, s
-HZ = 20.0  # rate of the clock with these delays, which are zero, one and three ticks
+DELAYS = (0.0, 0.1, 0.3)  # delays of an answer, s: zero, one and three ticks of the tabletop
 # The actions that are executed during the delay: none, the old plan, or the rows that the new plan
 # continues.
 LATE: dict[str, dict[str, Any]] = {
@@ -137,7 +142,7 @@ def ways() -> list[Way]:
         Way(f"open loop, all {CHUNK} rows", execute=CHUNK),
         Way("ensemble", {"actions": "ensemble"}, execute=1),
         *(
-            Way(f"{name}, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ, **settings))
+            Way(f"{name}, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, **settings))
             for name, settings in LATE.items()
             for s in DELAYS
         ),
@@ -293,7 +298,7 @@ def compared(found: Sequence[Played]) -> list[dict[str, Any]]:
     """
     standard = found[0]
     pairs = [_pairs(one, standard) for one in found]
-    adjusted = [1.0, *holm([pair.p_value for pair in pairs[1:]])]
+    adjusted = [1.0, *holm([mcnemar(pair.only_a, pair.only_b) for pair in pairs[1:]])]
     return [
         {
             "way": one.way.name,
@@ -302,7 +307,7 @@ def compared(found: Sequence[Played]) -> list[dict[str, Any]]:
             "interval_95": list(wilson(one.solved, len(one.episodes))),
             "act_ms": one.act_ms,
             **pair.to_json(),
-            "difference_95": list(difference_interval([pair])),
+            "difference_95": list(difference_interval([pair.starts])),
             "p_holm": p,
             "equal": sum(
                 one.episodes[seed][1] == standard.episodes[seed][1] for seed in standard.episodes

@@ -27,11 +27,11 @@ def played(folder: Path, *names: str, episodes: int = 2) -> dict[str, dict[str, 
 
 
 def test_ways_in_this_process(tmp_path: Path) -> None:
-    rows = played(tmp_path, "again", "bfloat16", "ensemble", "async, 50 ms", "LoRA merged")
+    rows = played(tmp_path, "again", "bfloat16", "ensemble", "async, 100 ms", "LoRA merged")
     assert rows["again"]["equal"] == 2
     assert (
         rows["bfloat16"]["equal"]
-        == rows["async, 50 ms"]["equal"]
+        == rows["async, 100 ms"]["equal"]
         == rows["LoRA merged"]["equal"]
         == 0
     )

@@ -10,14 +10,14 @@ is the case L = 0.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from vlagents_ray.chunking.buffer import ChunkBuffer, DelayEstimate
 from vlagents_ray.columns import Columns
-from vlagents_ray.contract import Contract
+from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.plan.config import ClockConfig
 
@@ -57,17 +57,17 @@ class ChunkExecutor:
             last: The last action of the task before, (D,), whose targets are kept.
 
         Raises:
-            ConfigError: The rate of the clock, or the action that holds the robot before the first
-                answer, is unknown.
+            ConfigError: The environment's rate, or the action that holds the robot before the first
+                answer, is unknown; or the latter does not fit the environment's actions.
         """
         self._execute = execute
         self._real_time = clock is not None
         self._clock = _SYNCHRONOUS if clock is None else clock
-        self._hz = self._clock.hz or env.control_hz or 0.0
+        self._hz = env.control_hz or 0.0
         if self._real_time and not self._hz:
             raise ConfigError(
-                "clock: expected hz, or an env whose contract declares control_hz, got neither; "
-                "give clock.hz, in 1/s"
+                "clock: expected an env whose contract declares control_hz, got none; declare the "
+                "rate of its steps, in 1/s (env_options.control_hz of an environment of Gymnasium)"
             )
 
         self._spec = env.action
@@ -77,6 +77,9 @@ class ChunkExecutor:
                 raise _needs_neutral()
             if dim is not None:
                 self._first_still(dim)
+
+        if self._clock.neutral is not None:
+            _require_fit(self._clock.neutral, env.action)
 
         self._plan = ChunkBuffer()
         self._tick = 0  # the number of the next tick in real-time mode
@@ -219,3 +222,16 @@ def _needs_neutral() -> ConfigError:
         "contract declares relative actions and the value of an open gripper, got neither; give "
         "clock.neutral, as zeros might command a motion to a pose"
     )
+
+
+def _require_fit(action: Sequence[float], spec: ActionSpec) -> None:
+    """Raise `ConfigError` unless the environment's contract accepts `clock.neutral`."""
+    expected = None
+    if spec.dim is not None and len(action) != spec.dim:
+        expected = f"{spec.dim} numbers, as the environment's actions have"
+    elif spec.low is not None and min(action, default=0.0) < spec.low:
+        expected = f"numbers of at least {spec.low:g}"
+    elif spec.high is not None and max(action, default=0.0) > spec.high:
+        expected = f"numbers of at most {spec.high:g}"
+    if expected is not None:
+        raise ConfigError(f"clock.neutral: expected {expected}, got {list(action)}; correct it")

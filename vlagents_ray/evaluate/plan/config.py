@@ -223,10 +223,6 @@ class ClockConfig(_PlanModel):
         "chunk, then a stop of the robot. `hold`: the last action again. `zero`: no "
         "motion, and the gripper as commanded.",
     )
-    hz: Hertz | None = Field(
-        default=None,
-        description="Number of ticks per second. null: the environment's `control_hz`.",
-    )
     align: bool = Field(
         default=True,
         description="Drop the rows for ticks at which other actions were executed before the "
