@@ -4,6 +4,7 @@ the results.
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 from dataclasses import replace
@@ -31,6 +32,7 @@ from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.errors import ConfigError, ConnectionLost, MissingState, PolicyFailed
 from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.evaluate.plan.cases import plan_cases
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.robot import (
     TrialsInterrupted,
     Verdict,
@@ -38,6 +40,7 @@ from vlagents_ray.evaluate.robot import (
     schedule,
     unblind,
 )
+from vlagents_ray.evaluate.robot.run import LoggedTrial, TrialLog
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Act, Obs
 
@@ -82,6 +85,7 @@ def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
         "the size of the file does not reveal the policy"
     )
     shown = {"trial", "attempt", "at", "outcome", "earned", "note", "score", "ending", "hidden"}
+    shown |= {"mac"}
     assert [set(line) for line in lines if "outcome" in line] == [shown] * 8
     found = summary.results
     assert found.policy_ids == list(NAMES), "at the end the policies are revealed"
@@ -386,7 +390,7 @@ def test_it_goes_on_with_the_next_trial(tmp_path: Path) -> None:
     )
 
 
-def test_a_line_that_a_killed_process_left_half_written_is_dropped(tmp_path: Path) -> None:
+def test_a_line_that_a_killed_process_left_half_written_is_completed(tmp_path: Path) -> None:
     config = plan(tmp_path / "out")
     with pytest.raises(TrialsInterrupted):
         evaluate_on_robot(
@@ -396,10 +400,9 @@ def test_a_line_that_a_killed_process_left_half_written_is_dropped(tmp_path: Pat
     whole = log.read_bytes()
     log.write_bytes(whole[:-40])
     again = config.model_copy(update={"resume": True})
-    with pytest.raises(TrialsInterrupted, match="after 1 of 8"):
+    with pytest.raises(TrialsInterrupted, match="after 2 of 8"):
         evaluate_on_robot(again, ScriptedPerson(typed([])), agent_factory=Policies())
-    last = json.loads(log.read_text().splitlines()[-1])
-    assert (last["trial"], last["again"]) == (2, "the evaluation ended before the verdict")
+    assert log.read_bytes() == whole, "the hidden line contains the line of the log"
 
 
 @pytest.mark.parametrize("damage", ["edited", "no JSON", "shortened", "missing"])
@@ -418,7 +421,7 @@ def test_a_hidden_file_that_was_changed_is_refused(tmp_path: Path, damage: str) 
     else:
         hidden.unlink()
     with pytest.raises(
-        ConfigError, match=r"hidden line of trial 1 is missing in .*, or was changed"
+        ConfigError, match=r"hidden line of (trial 1|the plan) is missing in .*, or was changed"
     ):
         evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=Policies())
 
@@ -434,7 +437,7 @@ def test_a_hidden_line_that_a_killed_process_left_incomplete_before_its_first_tr
     assert unblind(tmp_path / "out", KEY.decode()).total.episodes == 1
 
 
-def test_a_hidden_line_without_its_line_in_the_log_is_of_no_trial(tmp_path: Path) -> None:
+def test_a_hidden_line_without_its_line_in_the_log_completes_the_log(tmp_path: Path) -> None:
     """The process may be killed after it has written the hidden line, but before the line in the
     log.
     """
@@ -447,14 +450,70 @@ def test_a_hidden_line_without_its_line_in_the_log_is_of_no_trial(tmp_path: Path
     log.write_bytes(b"".join(complete[:-1]))
     hidden = tmp_path / "out" / "trials.hidden.jsonl"
     hidden.write_bytes(hidden.read_bytes() + b'{"result": {"ste')
-    with pytest.raises(TrialsInterrupted, match="after 0 of 8"):
+    with pytest.raises(TrialsInterrupted, match="after 1 of 8"):
         evaluate_on_robot(config, ScriptedPerson(typed([])), agent_factory=Policies())
+    assert log.read_bytes() == b"".join(complete)
     assert (
         evaluate_on_robot(
             config, ScriptedPerson(judged("s")), agent_factory=Policies()
         ).total.episodes
         == 8
     )
+
+
+def _damaged(lines: list[bytes]) -> dict[str, list[bytes]]:
+    """Return logs in which lines are deleted, repeated, exchanged or changed."""
+    logs = {}
+    for first, last in itertools.combinations(range(len(lines) + 1), 2):
+        logs[f"without lines {first} to {last}"] = lines[:first] + lines[last:]
+    for i, line in enumerate(lines):
+        logs[f"line {i} twice"] = [*lines[: i + 1], *lines[i:]]
+        for j in range(i):
+            exchanged = list(lines)
+            exchanged[i], exchanged[j] = lines[j], line
+            logs[f"lines {j} and {i} exchanged"] = exchanged
+        fields = json.loads(line)
+        for name, value in fields.items():
+            if value is None:
+                continue
+            other: Any = f"{value}0" if isinstance(value, str) else [value]
+            if isinstance(value, int | float):
+                other = value + 1
+            for change in ({name: other}, {name: None}, {"again": "a reason"}):
+                changed = [*lines]
+                changed[i] = json.dumps(
+                    fields | change, sort_keys=True, separators=(",", ":")
+                ).encode()
+                logs[f"line {i} with {change}"] = changed
+    return logs
+
+
+def test_no_line_of_the_log_can_be_changed_or_deleted(tmp_path: Path) -> None:
+    config = plan(tmp_path / "out", resume=True, robot={"key": None})
+    answers = ["", "f", "", "", "r", "the cup fell", "", "s", ""]
+    with pytest.raises(TrialsInterrupted):
+        evaluate_on_robot(config, ScriptedPerson(typed(answers)), agent_factory=Policies())
+    log, hidden = tmp_path / "out" / "trials.jsonl", tmp_path / "out" / "trials.hidden.jsonl"
+    lines, secret = log.read_bytes().splitlines(), hidden.read_bytes()
+    assert sum(b"hidden" in line for line in lines) == 4  # the plan, two results, a repetition
+
+    def attempts() -> list[LoggedTrial]:
+        with TrialLog(resolve(config)) as opened_log:
+            return opened_log.attempts
+
+    whole = attempts()
+    refused = 0
+    for name, damaged in _damaged(lines).items():
+        log.write_bytes(b"".join(line + b"\n" for line in damaged))
+        try:
+            found = attempts()
+        except ConfigError:
+            refused += 1
+        else:  # only the line of the last hidden line is missing, which is then written again
+            assert found == whole, name
+            assert log.read_bytes().splitlines() == lines, name
+        hidden.write_bytes(secret)
+    assert refused >= 100
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,9 @@ verdict.
 
 Until then, two files replace results.db. The log, `trials.jsonl`, has a line for each attempt at a
 trial, with the verdict. The policy, its checkpoint and its timing are in `trials.hidden.jsonl`,
-which the operator must not open. Each line of the log contains the hash of the corresponding hidden
-line, so neither line can be changed later without the other.
+which the operator must not open. The lines of the log are a chain: each contains the HMAC of its
+fields, of the hash of its hidden line, and of the line before it. So no line can be changed, added
+or deleted later without the key; only the ends of both files can be cut off together.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import logging
 import os
 import secrets
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +64,8 @@ KEY = "trials.key"
 # The lengths of hidden lines are padded to multiples of this number of bytes, so that the size of
 # the file does not reveal the policy.
 _BLOCK = 16384
+_RESTORE = "restore both files from one copy, or choose another out folder"
+_LINE = "line"  # field of a hidden line: its line in the log
 _KILLED = "the evaluation ended before the verdict"
 
 
@@ -91,11 +95,12 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
 
         Raises:
             ConfigError: The folder has a log and `plan.resume` is False, the log belongs to another
-                plan or key, the folder has results of a simulation, or another evaluation is
-                writing to the folder.
+                plan or key, a line of it was changed or deleted, the folder has results of a
+                simulation, or another evaluation is writing to the folder.
             StorageFailed: The folder cannot be written to.
         """
         self._path = plan.out / LOG
+        self._last_mac = ""  # the HMAC of the last line
         self.attempts: list[LoggedTrial] = []
         with storing(plan.out):
             plan.out.mkdir(parents=True, exist_ok=True)
@@ -155,22 +160,29 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
         """Read the attempts from the log, or create the log; `identity` is the hash of the plan's
         cases.
         """
-        lines = [json.loads(line) for line in self._log.read()]
-        hidden_lines = _by_hash(self.key, self._hidden.read())
+        lines = [self._parsed(line) for line in self._log.read()]
+        hidden_lines = self._hidden.read()
         if not lines:
+            if len(hidden_lines) > 1:
+                raise ConfigError(
+                    f"{self._path}: expected a line for each line of {HIDDEN}, got none; {_RESTORE}"
+                )
+            # The process may have been killed before it wrote the first line.
+            self._hidden.clear()
             self.started = time.time()
             settings = json.loads(plan.settings.model_dump_json(exclude_unset=True))
             self._write({"plan": identity, "at": self.started}, {"config": settings})
             return
 
-        if not hmac.compare_digest(lines[0]["plan"], identity):
+        if lines[0].get("plan") != identity:
             raise ConfigError(
                 f"{self._path}: expected a log of this plan, robot and key, got the log of another "
                 f"plan, robot or key; use the same ones, or choose another out folder"
             )
+        hidden_of_lines = self._verified(lines, hidden_lines)
         self.started = float(lines[0]["at"])
         unfinished_attempts: set[tuple[int, int]] = set()
-        for line in lines[1:]:
+        for line, hidden in zip(lines[1:], hidden_of_lines[1:], strict=True):
             if "unblinded" in line:
                 continue
 
@@ -180,29 +192,106 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
                 continue
 
             unfinished_attempts.discard(attempt)
-            hidden = hidden_lines.get(line.pop("hidden"))
-            if hidden is None:
-                raise ConfigError(
-                    f"{self._path}: the hidden line of trial {attempt[0]} is missing in {HIDDEN}, "
-                    "or was changed; restore both files from one copy, or choose another out folder"
-                )
-            self.attempts.append(
-                LoggedTrial(*attempt, line.pop("at"), visible=line, hidden=json.loads(hidden))
-            )
+            visible = {name: value for name, value in line.items() if name != "hidden"}
+            fields = json.loads(hidden or b"{}")
+            fields.pop(_LINE, None)
+            self.attempts.append(LoggedTrial(*attempt, visible.pop("at"), visible, fields))
 
         for attempt in unfinished_attempts:
             self.end(*attempt, {"again": _KILLED, "cause": "operator"}, {})
 
+    def _parsed(self, text: bytes) -> dict[str, Any]:
+        """Return the fields of a line; raises `ConfigError` if the line is not a JSON object."""
+        with contextlib.suppress(ValueError):
+            line = json.loads(text)
+            if isinstance(line, dict):
+                return line
+        raise ConfigError(f"{self._path}: expected lines in JSON, got {text[:60]!r}; {_RESTORE}")
+
+    def _verified(
+        self, lines: list[dict[str, Any]], hidden_lines: Sequence[bytes]
+    ) -> list[bytes | None]:
+        """Return the hidden line of each line, or None; and remove the HMAC from each line.
+
+        Raises:
+            ConfigError: A line is not the one that was written after the line before it, or its
+                hidden line is missing, or a hidden line has no line.
+        """
+        hidden_left = deque((_hash(self.key, hidden), hidden) for hidden in hidden_lines)
+        hidden_of_lines: list[bytes | None] = []
+        for number, line in enumerate(lines, 1):
+            mac = line.pop("mac", None)
+            expected = self._mac(line)
+            if mac != expected:
+                raise ConfigError(
+                    f"{self._path}: expected lines as they were written, got a line {number} that "
+                    f"was changed, or lines deleted before it; {_RESTORE}"
+                )
+            self._last_mac = expected
+            if "hidden" not in line:
+                hidden_of_lines.append(None)
+                continue
+            if not hidden_left or hidden_left[0][0] != line["hidden"]:
+                owner = f"trial {line['trial']}" if "trial" in line else "the plan"
+                raise ConfigError(
+                    f"{self._path}: the hidden line of {owner} is missing in {HIDDEN}, or was "
+                    f"changed; {_RESTORE}"
+                )
+            hidden_of_lines.append(hidden_left.popleft()[1])
+
+        self._complete(lines, hidden_of_lines, [hidden for _, hidden in hidden_left])
+        return hidden_of_lines
+
+    def _complete(
+        self,
+        lines: list[dict[str, Any]],
+        hidden_of_lines: list[bytes | None],
+        hidden_left: Sequence[bytes],
+    ) -> None:
+        """Write the last line from its hidden line, if the process was killed between the two.
+
+        Raises:
+            ConfigError: Hidden lines have no line, although the process was not killed.
+        """
+        if not hidden_left:
+            return
+        begun, line = lines[-1], {}
+        with contextlib.suppress(ValueError):
+            line = json.loads(hidden_left[0])[_LINE]
+        # An attempt has one end, so a single hidden line can be the end of the last attempt.
+        is_end = all(begun.get(name) == line.get(name, "") for name in ("trial", "attempt"))
+        if len(hidden_left) > 1 or "begun" not in begun or not is_end:
+            raise ConfigError(
+                f"{self._path}: expected a line for each line of {HIDDEN}, got {len(hidden_left)} "
+                f"results without one; {_RESTORE}"
+            )
+        line["hidden"] = _hash(self.key, hidden_left[0])
+        self._append(line)
+        lines.append(line)
+        hidden_of_lines.append(hidden_left[0])
+
     def _write(self, line: dict[str, Any], hidden: dict[str, Any] | None = None) -> None:
+        if hidden is None:
+            self._append(line)
+            return
+        text = json.dumps({**hidden, _LINE: line}, default=str).encode()
+        text += b" " * (-len(text) % _BLOCK)
         with storing(self._path.parent):
-            if hidden is not None:
-                text = json.dumps(hidden, default=str).encode()
-                text += b" " * (-len(text) % _BLOCK)
-                # Write the hidden line before the line with its hash, since the process may be
-                # killed in between.
-                self._hidden.append(text)
-                line = {**line, "hidden": _hash(self.key, text)}
-            self._log.append(canonical(line).encode())
+            # Write the hidden line before the line with its hash, since the process may be killed
+            # in between. The hidden line contains the line.
+            self._hidden.append(text)
+        self._append({**line, "hidden": _hash(self.key, text)})
+
+    def _append(self, line: dict[str, Any]) -> None:
+        """Append a line with its HMAC."""
+        mac = self._mac(line)
+        with storing(self._path.parent):
+            self._log.append(canonical({**line, "mac": mac}).encode())
+        self._last_mac = mac
+
+    def _mac(self, line: dict[str, Any]) -> str:
+        """Return the HMAC of a line after the last one."""
+        return _hash(self.key, f"{self._last_mac}\n{canonical(line)}".encode())
 
 
 class _JsonLines(contextlib.AbstractContextManager["_JsonLines"]):
@@ -232,6 +321,10 @@ class _JsonLines(contextlib.AbstractContextManager["_JsonLines"]):
         complete = data.rfind(b"\n") + 1
         self._file.truncate(complete)
         return data[:complete].splitlines()
+
+    def clear(self) -> None:
+        """Delete all lines."""
+        self._file.truncate(0)
 
     def append(self, line: bytes) -> None:
         """Append a line, and flush it to the disk."""
