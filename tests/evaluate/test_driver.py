@@ -132,6 +132,22 @@ def test_a_simulation_that_diverges_twice_under_the_same_actions_is_an_error_of_
     assert consumer.statuses == statuses
 
 
+@pytest.mark.parametrize("retries", [0, 1, 3])
+@pytest.mark.parametrize("first_diverges", [True, False])
+def test_an_episode_that_only_diverges_counts_as_a_failure_after_its_retries(
+    config: Config, retries: int, first_diverges: bool
+) -> None:
+    """Whatever its actions: a policy that samples without the seed never repeats them."""
+    consumer = Collected()
+    driver, [job, *_] = driver_of(config(retries=retries, abort_after=0), consumer)
+    for attempt in range(1, retries + 2):
+        diverged = EpisodeResult(job.key, "policy_error", steps=3, actions_sha256=str(attempt))
+        has_diverged = (attempt == 1) == first_diverges or retries == 0
+        failure = replace(BROKEN, diverged=diverged) if has_diverged else BROKEN
+        driver.take(replace(job, attempt=attempt), Report(failure=failure))
+    assert consumer.statuses == ["policy_error"], "one attempt in which it diverged suffices"
+
+
 def test_a_mistake_of_the_user_ends_it_at_once(config: Config) -> None:
     consumer = Collected()
     driver, [job, *_] = driver_of(config(), consumer)

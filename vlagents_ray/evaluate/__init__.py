@@ -32,6 +32,7 @@ from vlagents_ray.evaluate.results.statistics import (
     difference_interval,
     holm,
     mcnemar,
+    paired_test,
     wilson,
 )
 from vlagents_ray.evaluate.results.summary import Group, Summary
@@ -81,6 +82,7 @@ __all__ = [
     "mcnemar",
     "most_cpus",
     "most_gpus",
+    "paired_test",
     "print_summary",
     "progress_for",
     "resolve",

@@ -124,8 +124,8 @@ class Driver:
         self._consumer = consumer
         self._lost = 0  # number of consecutive lost episodes
         self._policy_errors = 0  # number of consecutive episodes with a policy error
-        # Number of steps and digest of the actions of each episode whose simulation diverged.
-        self._diverged: dict[EpisodeKey, tuple[int, str | None]] = {}
+        # The last result of each episode whose simulation diverged, if the policy is the cause.
+        self._diverged: dict[EpisodeKey, EpisodeResult] = {}
 
     @property
     def waiting(self) -> int:
@@ -188,8 +188,7 @@ class Driver:
     def _failed(self, job: Job, failure: Failure) -> None:
         """Repeat a failed attempt, or finish its episode as lost."""
         if failure.diverged is not None and self._diverged_before(job, failure.diverged):
-            # The simulation diverged again under the same actions, so the policy is the cause, and
-            # has failed.
+            # The simulation diverged again under the same actions, so further attempts would, too.
             self._finish(job, failure.diverged, Artifacts())
             return
 
@@ -200,6 +199,10 @@ class Driver:
             raise from_code(failure.code, failure.message)
         if repeated:
             self.queue.put_back(job.again(alone=self._must_be_alone(job, failure)))
+        elif is_needed and job.key in self._diverged:
+            # A policy that makes the simulator diverge, with other actions at each attempt, has
+            # failed. Otherwise, its episodes would be in no rate, and it would win comparisons.
+            self._finish(job, self._diverged[job.key], Artifacts())
         elif is_needed:
             error = f"{failure.code}: {failure.message}"
             lost = EpisodeResult(job.key, "infra_failed", error=error)
@@ -221,10 +224,12 @@ class Driver:
         """Return whether the simulation of an episode has diverged before under the same
         actions.
         """
-        actions = (result.steps, result.actions_sha256)
         earlier = self._diverged.get(job.key)
-        self._diverged[job.key] = actions
-        return earlier == actions
+        self._diverged[job.key] = result
+        return earlier is not None and (earlier.steps, earlier.actions_sha256) == (
+            result.steps,
+            result.actions_sha256,
+        )
 
     def _finish(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
         """Pass the result of a finished episode to the consumer."""

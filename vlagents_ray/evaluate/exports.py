@@ -114,6 +114,9 @@ COLUMNS = (
     _of_result("return", "number", "sum of the rewards", "episode_return"),
     _of_result("ending", "string", "terminated, truncated, policy_done or error"),
     _of_result("instruction", "string", "the task in words"),
+    _of_result(
+        "start", "string", "name of the initial state, which equal starts share; null on a robot"
+    ),
     _of_result("error", "string", "error, if the status is not done"),
     _of_result(
         "actions_sha256",

@@ -28,6 +28,8 @@ from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.replay import find
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.combination import combined
+from vlagents_ray.evaluate.results.database import FILE
+from vlagents_ray.evaluate.results.reader import is_sequential
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.interface import Obs
 from vlagents_ray_results.merge import merge
@@ -64,6 +66,23 @@ def outcomes(results: Results) -> dict[str, object]:
     return {
         str(one.result.key): one.result.outcome for case in results.cases for one in case.episodes
     }
+
+
+def test_a_folder_that_began_after_the_first_results_is_a_plan_that_grew(
+    part: Callable[..., Path], tmp_path: Path
+) -> None:
+    first, later = part("first"), part("later", seeds=[100])
+    for folder in (first, later):
+        assert not is_sequential(Results.load(folder).cases)
+    for name, folders in (("ab", [first, later]), ("ba", [later, first])):
+        merged = merge(tmp_path / name, folders).results
+        assert is_sequential(merged.cases)
+
+    # Plans of one moment are one plan.
+    for folder in (first, later):
+        with closing(sqlite3.connect(folder / FILE)) as db, db:
+            db.execute("UPDATE cases SET planned_at = 1.0")
+    assert not is_sequential(merge(tmp_path / "one", [first, later]).results.cases)
 
 
 def test_parts_that_overlap_make_the_whole_each_episode_as_the_first_has_it(

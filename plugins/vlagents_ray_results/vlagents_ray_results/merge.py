@@ -217,7 +217,13 @@ def _extend(case: Row, other: Row, folder: Path) -> None:
             f"{episodes} episodes, got {added}, together {ordered}, with which some episodes "
             f"would be run twice"
         )
-    case |= {"seeds": canonical(seeds), "planned": episodes * len(seeds)}
+    # A folder that began after the first results of another one may have been added for them.
+    planned_at = max(case["planned_at"], other["planned_at"])
+    case |= {
+        "seeds": canonical(seeds),
+        "planned": episodes * len(seeds),
+        "planned_at": planned_at,
+    }
 
 
 def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[str]:

@@ -241,31 +241,35 @@ def test_a_simulation_that_diverges_again_under_the_same_actions_is_a_failure_of
     assert {(one.status, one.steps, one.success_once) for one in failed} == {
         ("policy_error", 3, False)
     }
-    assert all("diverged, and again under the same actions" in str(one.error) for one in failed)
+    assert all("diverged, and again when it was repeated" in str(one.error) for one in failed)
     assert len(summary.results.cases[0].attempts) == 3, (
         "the first attempts of all episodes are kept"
     )
 
 
-def test_a_simulation_that_diverges_under_other_actions_is_lost_and_bounds_stand_beside_the_rate(
-    config: Config, tmp_path: Any
+def test_a_simulation_that_diverges_under_other_actions_is_a_failure_after_its_retries(
+    tmp_path: Any,
 ) -> None:
     settings = flat_config(
         envs=[NAME],
         env_options={"trouble": "diverges"},
         episodes=EPISODES,
         workers=0,
-        video="none",
         out=tmp_path / "out",
         retries=1,
     )
     summary = evaluate(settings, agent_factory=lambda: Extreme(restless=True))
     [group] = summary.cases
-    assert (group.success_once.successes, group.success_once.episodes, group.infra_failures) == (
-        5,
-        5,
-        3,
-    )
+    once = group.success_once
+    assert (once.successes, once.episodes, group.infra_failures) == (5, EPISODES, 0)
+
+
+def test_the_bounds_with_lost_episodes_stand_beside_the_rate(
+    run: Callable[..., Summary], tmp_path: Any
+) -> None:
+    summary = run("raises")
+    [group] = summary.cases
+    assert (group.success_once.episodes, group.infra_failures) == (5, 3)
     assert group.with_lost(group.success_once) == (5 / 8, 1.0)
     assert summary.to_json()["cases"][0]["with_lost"]["success_once"] == (5 / 8, 1.0)
     page = write_report(summary.results, tmp_path / "page.html").read_text()

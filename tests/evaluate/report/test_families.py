@@ -4,9 +4,11 @@ clocks.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 from io import StringIO
 from pathlib import Path
@@ -28,7 +30,7 @@ from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.report.results_document import ResultsDocument
 from vlagents_ray.evaluate.report.success import compare_all, families, families_json
 from vlagents_ray.evaluate.results.comparison import compare
-from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Run
+from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Run, by_timing
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE
 from vlagents_ray.evaluate.results.summary import Summary, summarize
 from vlagents_ray_results.merge import merge
@@ -213,8 +215,61 @@ def test_no_output_pools_episodes_of_two_clocks(
             f"{output} lacks the rate of one clock, {expected:.3f}"
         )
     a, b = results.policy_ids[0], results.policy_ids[-1]
-    with pytest.raises(ConfigError, match="several clocks"):
+    with pytest.raises(ConfigError, match="several timings"):
         compare(results, a, b)
+
+
+# The kinds of timing, with the settings of a case.
+KINDS: dict[str, dict[str, Any]] = {
+    "synchronous": {},
+    "in real time": {"clock": {"latency": 0.1}},
+    "in real time, slower": {"clock": {"latency": 0.2}},
+    "on the robot": {"robot": {"arm": "x:Y", "hz": 20.0, "task": {"instruction": "go"}}},
+    "on the robot, faster": {"robot": {"arm": "x:Y", "hz": 50.0, "task": {"instruction": "go"}}},
+}
+
+
+@pytest.mark.parametrize(("one", "other"), list(itertools.combinations(KINDS, 2)))
+def test_no_two_kinds_of_timing_share_a_rate_or_a_pair(one: str, other: str) -> None:
+    cases = []
+    for kind, solved in ((one, True), (other, False)):
+        for policy in ("a", "b"):
+            settings = {"policy": policy, "clock": None} | KINDS[kind]
+            episodes = tuple(_episode(number, solved=solved) for number in range(4))
+            cases.append(
+                CaseResults(
+                    f"{policy} {kind}", policy, None, kind, LINE, 4, settings, *({},) * 4,
+                    episodes, (),
+                )
+            )  # fmt: skip
+    results = Results(Path("/nowhere"), tuple(cases), (Run(1, 0.0, 1.0, "complete", {}, {}),), {})
+    assert [len(members) for members in by_timing(cases).values()] == [2, 2]
+    summary = summarize(results)
+    for total in summary.totals:
+        assert (total.success_once.rate, total.mean_steps, total.mean_return) == (None,) * 3
+    table = success.success_table(summary)
+    assert {group.success_once.rate for block in table.blocks for group in block.groups} == {0, 1}
+    with pytest.raises(ConfigError, match="several timings"):
+        compare(results, "a", "b")
+    for timing in by_timing(cases):
+        assert compare(results, "a", "b", timing=timing).total.pairs.total == 4
+
+    # A policy of one kind and a policy of the other kind in the same env are no pair.
+    mixed = [replace(case, suite="") for case in (cases[0], cases[3])]
+    with pytest.raises(ConfigError, match=r"expected the same (clock|robot)"):
+        compare(results.among(mixed), "a", "b")
+
+
+def test_two_tasks_of_one_robot_are_one_timing() -> None:
+    cases = []
+    for task in ("cup", "drawer"):
+        robot = {"arm": "x:Y", "hz": 20.0, "task": {"instruction": task}}
+        cases.append(
+            CaseResults(
+                task, "a", None, "", task, 1, {"clock": None, "robot": robot}, *({},) * 4, (), ()
+            )
+        )
+    assert list(by_timing(cases)) == ["on the robot"]
 
 
 def test_episodes_in_real_time_change_nothing_of_those_that_wait(

@@ -13,7 +13,7 @@ from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.report.page import configuration
 from vlagents_ray.evaluate.results.combination import combined
 from vlagents_ray.evaluate.results.comparison import clock_gaps, comparable, compare, comparisons
-from vlagents_ray.evaluate.results.statistics import Pairs
+from vlagents_ray.evaluate.results.statistics import Pairs, sum_of
 
 
 def solved_by(**seeds: set[int]) -> Any:
@@ -25,9 +25,13 @@ def test_pairs_are_episodes_of_the_same_env_and_seed(tmp_path: Path) -> None:
     config = runs(tmp_path, episodes=5, steps=[])
     found = compare(record(config, solved_by(learner={0, 1, 2}, base={2, 3})), "learner", "base")
     in_each = Pairs(both=1, only_a=2, only_b=1, neither=1)
-    assert found.total.strata == (in_each,) * 3
+    assert [line.suite for line in found.suites] == ["one", "two"]
+    one, two = (line.outcomes.strata for line in found.suites)
+    assert one == (in_each.starts,) * 2
+    assert two == (in_each.starts,)
+    # Both suites have the environment LINE, whose starts are repeated.
     assert found.total.pairs == in_each + in_each + in_each
-    assert [(line.suite, len(line.strata)) for line in found.suites] == [("one", 2), ("two", 1)]
+    assert (found.total.starts, len(found.total.outcomes.strata)) == (10, 2)
     low, high = found.total.interval
     assert low < found.total.pairs.difference < high  # type: ignore[operator]
 
@@ -36,9 +40,12 @@ def test_what_infrastructure_lost_is_in_no_pair(tmp_path: Path) -> None:
     results = record(
         runs(tmp_path, episodes=5, steps=[]), solved_by(learner=set(), base={0, 1}), troubles=True
     )
-    first = compare(results, "learner", "base").total.strata[0]
+    line = compare(results, "learner", "base").suites[0]
     # Seed 1 has only base's episode; the policy's error with seed 0 counts as a failure.
-    assert first == Pairs(only_b=1, neither=3)
+    assert sum_of(line.outcomes.strata[:1]) == Pairs(only_b=1, neither=3)
+    assert line.lost == 1
+    assert sum_of(line.outcomes.worst[:1]) == Pairs(only_b=2, neither=3)
+    assert sum_of(line.outcomes.best[:1]) == Pairs(both=1, only_b=1, neither=3)
 
 
 def test_p_values_of_more_comparisons_are_larger(tmp_path: Path) -> None:
@@ -52,7 +59,7 @@ def test_p_values_of_more_comparisons_are_larger(tmp_path: Path) -> None:
     assert reasons == []
     together = comparisons(results, pairs)
     alone = [compare(results, a, b) for a, b in pairs]
-    assert [one.total.adjusted for one in alone] == [one.total.pairs.p_value for one in alone]
+    assert [one.total.adjusted for one in alone] == [one.total.p_value for one in alone]
     assert all(
         one.total.adjusted >= single.total.adjusted
         for one, single in zip(together, alone, strict=True)

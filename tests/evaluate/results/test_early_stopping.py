@@ -19,7 +19,7 @@ from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results.early_stopping import CaseStopping
 from vlagents_ray.evaluate.results.reader import rate_of
-from vlagents_ray.evaluate.results.statistics import confidence_sequence, pooled, wilson
+from vlagents_ray.evaluate.results.statistics import Rate, confidence_sequence, pooled, wilson
 
 Config = Callable[..., EvalConfig]
 
@@ -54,7 +54,7 @@ def test_looking_after_each_episode_costs_width(successes: int, trials: int) -> 
 
 def test_nothing_is_known_without_episodes() -> None:
     assert confidence_sequence(0, 0) == (0, 1)
-    assert pooled([(0, 0)], 0.05) == (0, 1)
+    assert pooled([Rate(0, 0)], 0.05) == (0, 1)
     with pytest.raises(InvalidInput, match="expected 0 <= successes <= trials"):
         confidence_sequence(3, 2)
 
@@ -87,11 +87,11 @@ def test_the_true_rate_is_missed_no_more_often_than_is_said_whenever_one_looks(r
 
 
 def test_several_cases_share_the_error_rate() -> None:
-    low, high = pooled([(9, 10), (5, 30), (0, 0)], 0.05)
+    low, high = pooled([Rate(9, 10), Rate(5, 30), Rate(0, 0)], 0.05)
     first, second = confidence_sequence(9, 10, 0.025), confidence_sequence(5, 30, 0.025)
     assert low == pytest.approx((first[0] * 10 + second[0] * 30) / 40)
     assert high == pytest.approx((first[1] * 10 + second[1] * 30) / 40)
-    assert pooled([(9, 10)], 0.05) == confidence_sequence(9, 10, 0.05)
+    assert pooled([Rate(9, 10)], 0.05) == confidence_sequence(9, 10, 0.05)
 
 
 def test_a_case_stops_when_the_target_is_excluded() -> None:
@@ -192,7 +192,7 @@ def test_what_a_stopped_case_says_holds_and_resuming_plays_nothing(config: Confi
         config(episodes=40, workers=0, resume=True, accept_changes=True), agent_factory=ToZero
     )
     assert whole.total.episodes == 40
-    assert whole.total.success_once.error_rate is None
+    assert whole.total.success_once.error_rate == 0.05, "the plan changed after the first results"
 
 
 def outcome(one: EpisodeResult) -> tuple[object, ...]:

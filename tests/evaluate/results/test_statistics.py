@@ -46,7 +46,7 @@ def test_nothing_is_known_without_episodes() -> None:
     assert wilson(0, 0) == (0.0, 1.0)
     assert Rate(0, 0).rate is None
     assert Rate(0, 0).to_json()["wilson_95"] == [0.0, 1.0]
-    assert difference_interval([]) == difference_interval([Pairs()]) == (-1.0, 1.0)
+    assert difference_interval([]) == difference_interval([Pairs().starts]) == (-1.0, 1.0)
 
 
 def test_impossible_counts_are_refused() -> None:
@@ -112,21 +112,21 @@ def test_the_interval_covers_the_difference_at_least_about_as_often_as_it_says(
     covered = 0
     for _ in range(200):
         strata = [Pairs(*map(int, rng.multinomial(episodes, one))) for one in chances]
-        low, high = difference_interval(strata)
+        low, high = difference_interval([pairs.starts for pairs in strata])
         covered += low <= true <= high
     assert covered / 200 > 0.915  # 0.95 minus two and a quarter standard deviations of 200 trials
 
 
 def test_the_interval_is_narrower_for_knowing_the_tasks() -> None:
     strata = [Pairs(only_a=18, neither=2), Pairs(only_b=18, neither=2)]
-    low, high = difference_interval(strata)
-    pooled_low, pooled_high = difference_interval([strata[0] + strata[1]])
+    low, high = difference_interval([pairs.starts for pairs in strata])
+    pooled_low, pooled_high = difference_interval([(strata[0] + strata[1]).starts])
     assert pooled_low < 2 * low < 0 < 2 * high < pooled_high
 
 
 @given(st.builds(Pairs, COUNTS, COUNTS, COUNTS, COUNTS).filter(lambda pairs: pairs.total > 0))
 def test_the_interval_holds_the_difference_and_is_never_certain(pairs: Pairs) -> None:
-    low, high = difference_interval([pairs])
+    low, high = difference_interval([pairs.starts])
     assert pairs.difference is not None
     assert -1.0 <= low <= pairs.difference <= high <= 1.0
     assert low < high
@@ -139,13 +139,15 @@ def test_the_interval_is_what_drawing_again_comes_to() -> None:
         outcomes = np.array([one.only_a, one.only_b, one.both, one.neither]) + 0.5 * one.total / 80
         counts = rng.multinomial(one.total, outcomes / outcomes.sum(), len(drawn))
         drawn += counts[:, 0] - counts[:, 1]
-    assert difference_interval(strata) == pytest.approx(
+    assert difference_interval([pairs.starts for pairs in strata]) == pytest.approx(
         tuple(np.quantile(drawn / 80, [0.025, 0.975])), abs=1e-9
     )
 
 
 def test_thousands_of_episodes_narrow_the_interval() -> None:
-    few, many = (difference_interval([Pairs(5 * k, 2 * k, k, 2 * k)] * 3) for k in (10, 1000))
+    few, many = (
+        difference_interval([Pairs(5 * k, 2 * k, k, 2 * k).starts] * 3) for k in (10, 1000)
+    )
     assert many[0] == pytest.approx(0.1 - 1.96 * (0.29 / 30_000) ** 0.5, abs=5e-4)
     assert few[0] < many[0] < 0.1 < many[1] < few[1]
 

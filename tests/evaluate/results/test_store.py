@@ -15,7 +15,8 @@ from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, Worker
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
-from vlagents_ray.evaluate.results.reader import Results
+from vlagents_ray.evaluate.report.page import write_report
+from vlagents_ray.evaluate.results.reader import Results, is_sequential
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
 
@@ -167,11 +168,50 @@ def test_resuming_a_folder_without_results_says_so(
 def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) -> None:
     with Store(resolve(config())) as store:
         store.begin_run({})
-    Store(resolve(config(resume=True, **change))).close()
+    with Store(resolve(config(resume=True, **change))) as store:
+        store.begin_run({})
     known = {case.case_id for case in Results.load(config().out).cases}
     assert known >= {
         case.fingerprint for one in (config(), config(**change)) for case in plan_cases(one)
     }
+
+
+@pytest.mark.parametrize(
+    ("change", "recorded"),
+    [
+        ({"episodes": 8}, "eval_fakes:Line: episodes was 6, is 8"),
+        ({"seeds": [0, 100]}, "eval_fakes:Line: seeds was [0], is [0, 100]"),
+        ({"envs": [LINE, OTHER_LINE]}, "eval_fakes:OtherLine was not there, is in it"),
+        ({"video": "all"}, None),
+        ({}, None),
+    ],
+)
+@pytest.mark.parametrize("number", [0, 2, 6])
+def test_a_plan_that_grows_after_a_result_says_so(
+    config: Config, change: dict[str, object], recorded: str | None, number: int
+) -> None:
+    with Store(resolve(config())) as store:
+        store.begin_run({})
+        for job in planned(config())[:number]:
+            store.record(done(job.key), attempts=1)
+    grown = config(resume=True, **change)
+    Store(resolve(grown)).close()  # as the check before policies are served
+    for _ in range(2):  # an unchanged plan does not take the change back
+        with Store(resolve(grown)) as store:
+            store.begin_run({})
+            for job in planned(grown):
+                if str(job.key) not in store.finished():
+                    store.record(done(job.key), attempts=1)
+    results = Results.load(grown.out)
+    changes = [str(change) for change in results.accepted_changes]
+    assert len(changes) == (recorded is not None and number > 0)
+    assert is_sequential(results.cases) == bool(changes)
+    assert all(recorded in change for change in changes if recorded)
+    summary = summarize(results).to_json()
+    assert bool(summary["confidence_sequences"]) == bool(changes)
+    page = write_report(results, results.out / "report.html").read_text()
+    assert ("Changes of the plan" in page) == bool(changes)
+    assert ("the plan changed after the first results" in page) == bool(changes)
 
 
 def test_two_evaluations_do_not_write_to_one_folder(config: Config) -> None:
@@ -254,7 +294,8 @@ def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) ->
         ]
         [group] = summarize(Results.load(config().out)).cases
         assert (group.episodes, group.planned) == (2, 3)
-    with Store(resolve(config(resume=True))):
+    with Store(resolve(config(resume=True))) as store:
+        store.begin_run({})
         assert [one.counts for one in Results.load(config().out).cases[0].episodes] == [True] * 3
 
 

@@ -30,7 +30,13 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.evaluate.episode import failures
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor, Tick
-from vlagents_ray.evaluate.episode.records import Ending, EpisodeObserver, EpisodeResult, version_of
+from vlagents_ray.evaluate.episode.records import (
+    Ending,
+    EpisodeObserver,
+    EpisodeResult,
+    start_of,
+    version_of,
+)
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import POLICY, Act, Agent, Obs
@@ -50,6 +56,7 @@ _FIELDS_OF_RESULT = (  # names of the fields that `EpisodeStats` and `EpisodeRes
     "policy_version",
     "policy_fingerprint",
     "first_policy_version",
+    "start",
 )
 
 
@@ -75,6 +82,7 @@ class EpisodeStats:
     first_policy_version: int | None = None
     actions: Any = field(default_factory=hashlib.sha256)  # digest of the executed actions
     reset_ms: float | None = None
+    start: str | None = None  # name of the initial state, see `start_of`
     step_ms: list[float] = field(default_factory=list)
     act_ms: list[float] = field(default_factory=list)
     policy_seconds: float = 0.0
@@ -173,8 +181,7 @@ class Diverged:
     """
 
     error: VLAgentsError
-    # The result that applies if the simulation diverges again under the same actions, i.e. if the
-    # policy is the cause.
+    # The result that applies if no attempt succeeds, since the policy is then the cause.
     result: EpisodeResult
 
 
@@ -264,13 +271,18 @@ def run_episodes(
 
     observers = observers or [EpisodeObserver()] * len(keys)
     episodes: list[_Episode] = []
-    for key, session, observer, obs, text in zip(
-        keys, sessions, observers, observations, instructions, strict=True
+    for key, session, observer, obs, text, reset_option in zip(
+        keys, sessions, observers, observations, instructions, options, strict=True
     ):
         observer.add_observation(obs)
         timeliness = None if clock is None else Timeliness()
         stats = EpisodeStats(
-            key, start, instructions=[text], reset_ms=reset_ms, timeliness=timeliness
+            key,
+            start,
+            instructions=[text],
+            reset_ms=reset_ms,
+            start=start_of(obs, text, reset_option),
+            timeliness=timeliness,
         )
         episodes.append(_Episode(len(episodes), session, stats, observer, new_executor, obs))
 
@@ -426,7 +438,7 @@ class _Episode:
     def diverged(self, error: VLAgentsError) -> None:
         """End the episode, because the simulation diverged at the next of `ticks`."""
         self._executed()
-        cause = PolicyFailed(f"the simulation diverged, and again under the same actions: {error}")
+        cause = PolicyFailed(f"the simulation diverged, and again when it was repeated: {error}")
         self.outcome = Diverged(error, self.stats.result(transport_of(self.session), cause))
 
     def failed(self, error: VLAgentsError) -> None:

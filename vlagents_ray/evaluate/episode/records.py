@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
@@ -67,6 +68,9 @@ class EpisodeResult:
     first_policy_version: int | None = None  # version of the weights that computed the first action
     # Digest of the executed actions, (steps, D) little-endian float32, row by row.
     actions_sha256: str | None = None
+    # Name of the initial state. Episodes with equal names begin in the same state (see `start_of`);
+    # None on a robot.
+    start: str | None = None
 
     @property
     def time_share(self) -> TimeShare | None:
@@ -113,6 +117,7 @@ _CIRCUMSTANCES = {
     "policy_version",
     "policy_fingerprint",
     "first_policy_version",
+    "start",  # another renderer gives other pictures
 }
 
 
@@ -138,6 +143,32 @@ class WorkerInfo:
     policy: str  # name of the policy in the evaluation
     transport: str
     renderer: str | None  # the driver's name of the rendering device; None if no device renders
+
+
+def start_of(obs: Obs, instruction: str, options: Mapping[str, Any] | None) -> str:
+    """Return the name of an episode's initial state.
+
+    It is the number of the state, if the environment has a fixed number of states; otherwise the
+    beginning of the SHA-256 digest of the instruction and the first observation.
+
+    Args:
+        obs: The first observation.
+        instruction: The first instruction.
+        options: The options of the environment's reset.
+    """
+    state = (options or {}).get("init_state")
+    if isinstance(state, int | np.integer):
+        return f"init_state {state}"
+
+    digest = hashlib.sha256(instruction.encode())
+    named = [("gripper", obs.gripper), *obs.state.items(), *obs.cameras.items()]
+    # Simulators give their whole state in this way.
+    named += [(name, value) for name, value in obs.info.items() if isinstance(value, np.ndarray)]
+    for name, value in named:
+        array = np.ascontiguousarray(0.0 if value is None else value)
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()[:_DIGITS]
 
 
 class EpisodeObserver:

@@ -44,8 +44,8 @@ def bounds(values: tuple[float, float] | None) -> str:
 
 
 def interval_name(rate: Rate) -> str:
-    """Return the name of the rate's interval: a confidence sequence if cases could stop early,
-    otherwise Wilson's interval.
+    """Return the name of the rate's interval: a confidence sequence if the number of episodes may
+    depend on their outcomes, otherwise Wilson's interval.
     """
     if rate.error_rate is None:
         return "95 % Wilson interval"

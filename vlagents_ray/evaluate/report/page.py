@@ -150,11 +150,10 @@ def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
     rates; None for any other report.
 
     The headline is not the rate of the better policy, which would be biased upwards because the
-    policy is selected by its rate. Cases that may stop early have no headline, since the intervals
-    of their differences are not valid.
+    policy is selected by its rate. Cases that stopped after different numbers of episodes have no
+    headline, since they have no common rate.
     """
-    may_stop = any(group.success_once.error_rate is not None for group in summary.cases)
-    if compared is None or may_stop:
+    if compared is None or not summary.has_one_rate_each:
         return None
     differences: list[Difference] = []
     for part in compared.parts:
@@ -330,6 +329,7 @@ class Configuration:
 
     runs: tuple[Run, ...]
     changes: list[Change]  # changes of files or weights between episodes
+    plan_changes: list[Change]  # changes of the plan after the first results
     programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files by path)
     # (policy id, checkpoint, commit, digest or version of the weights)
     checkpoints: list[tuple[str, str]]
@@ -402,7 +402,8 @@ def configuration(results: Results) -> Configuration:
 
     return Configuration(
         runs=results.runs,
-        changes=results.accepted_changes,
+        changes=[change for change in results.accepted_changes if not change.is_of_plan],
+        plan_changes=[change for change in results.accepted_changes if change.is_of_plan],
         programs=list(programs.items()),
         checkpoints=list(checkpoints),
         workers=[

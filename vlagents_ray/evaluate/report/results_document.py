@@ -20,6 +20,7 @@ from vlagents_ray.evaluate.results.reader import (
     CaseResults,
     Episode,
     Results,
+    is_sequential,
     rate_of,
     time_share_of,
 )
@@ -164,7 +165,7 @@ def _case(case: CaseResults) -> dict[str, Any]:
         "done": _done(case),
         "planned": _planned(case),
         "stopped": case.stopped_at is not None,
-        "sequence": case.stop is not None,
+        "sequence": is_sequential([case]),
         # Share of the ticks in time, among the ticks that need an action of the policy; None if the
         # environment waits for the policy.
         "share_in_time": None if time_share is None else time_share.share,

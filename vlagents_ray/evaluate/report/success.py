@@ -35,7 +35,9 @@ class SuccessTable:
 
     blocks: list[Block]
     several: bool  # whether there are several policy ids
-    stopped: int | None  # number of cases that stopped early; None if no case could stop early
+    # The reasons why the intervals are confidence sequences; empty if they are Wilson's.
+    sequence: list[str]
+    repeats: bool  # whether some episodes begin in the same initial state
     pooled: bool  # whether every policy has a common rate for all its cases
     some_lost: bool  # whether episodes were lost to infrastructure
 
@@ -55,7 +57,8 @@ def success_table(summary: Summary) -> SuccessTable:
     return SuccessTable(
         list(_blocks(summary)),
         several=len(summary.results.policy_ids) > 1,
-        stopped=None if total.success_once.bounds is None else total.stopped,
+        sequence=summary.reasons_of_sequence,
+        repeats=any(group.success_once.independent is not None for group in summary.cases),
         pooled=summary.has_one_rate_each,
         some_lost=total.infra_failures > 0,
     )
@@ -188,8 +191,10 @@ class Difference:
     suite: str
     pairs: Pairs
     interval: tuple[float, float]  # 95 % interval
+    p_value: float
     adjusted: float  # p-value
     decided: bool
+    lost: int  # number of further pairs with an episode that infrastructure lost
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,6 +214,7 @@ class Comparisons:
     parts: list[ComparisonPart]
     left_out: int  # number of further pairs that are not compared, if there are very many pairs
     several_timings: bool
+    lost: int  # largest number of pairs of a comparison with a lost episode
     reasons: list[str]  # reasons why some pairs cannot be compared
     changes: list[Change]  # accepted differences between environments of compared policies
 
@@ -293,6 +299,7 @@ def compare_all(summary: Summary, *, accept_changes: bool = False) -> Comparison
         parts,
         left_out,
         several_timings=len(parts) > 1,
+        lost=max((row.lost for part in parts for row in part.shown + part.folded), default=0),
         reasons=reasons,
         changes=list(dict.fromkeys(changes)),
     )
@@ -310,8 +317,10 @@ def _difference(comparison: Comparison, line: Line) -> Difference:
         line.suite,
         line.pairs,
         line.interval,
+        line.p_value,
         line.adjusted,
         decided=line.adjusted < ERROR_RATE,
+        lost=line.lost,
     )
 
 

@@ -22,6 +22,7 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
+from vlagents_ray.evaluate.results.reader import CaseResults
 from vlagents_ray.evaluate.results.statistics import Rate, confidence_sequence
 from vlagents_ray.evaluate.results.summary import (
     Group,
@@ -247,7 +248,7 @@ def results_table(summary: Summary) -> Table:
     interval = "the Wilson 95 % interval"
     error_rate = summary.total.success_once.error_rate
     if error_rate is not None:
-        interval = f"the confidence sequence of early stopping (error rate {error_rate:.2g})"
+        interval = f"a confidence sequence (error rate {error_rate:.2g})"
     title = f"{', '.join(names)}: success in %, with {interval}"
     table = Table(title=title, box=SIMPLE_HEAD, padding=0, pad_edge=False)
 
@@ -290,7 +291,10 @@ def print_summary(console: Console, summary: Summary) -> None:
         console.print(_errors_table(summary))
 
     lines = [*_speed(summary), *_losses(summary)]
-    lines += [f"accepted change: {change}" for change in summary.results.accepted_changes]
+    for change in summary.results.accepted_changes:
+        kind = "changed after the first results" if change.is_of_plan else "accepted change"
+        lines.append(f"{kind}: {change}")
+    lines += _intervals(summary)
     lines += [*_pushed_weights(summary), *_early_stops(summary), *_clock_gaps(summary)]
     lines += _times(summary)
     if summary.state == RUNNING:
@@ -301,8 +305,22 @@ def print_summary(console: Console, summary: Summary) -> None:
     lines.append(f"results: {summary.out}")
     written = {"report": summary.out / FILE, "videos": summary.out / "videos"}
     lines += [f"{name}: {path}" for name, path in written.items() if path.exists()]
+    unsolved = next((case for case in summary.results.cases if _unsolved(case) is not None), None)
+    if unsolved is not None and not written["videos"].exists():
+        lines.append(
+            "videos: none; --video failures writes them, and `vlagents-ray replay "
+            f"{summary.out} '{unsolved.env}#{_unsolved(unsolved)}'` films a failure now"
+        )
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _unsolved(case: CaseResults) -> int | None:
+    """Return the number of the first unsolved episode in simulation; None if there is none."""
+    if "robot" in case.settings:
+        return None
+    numbers = (result.key.episode for result in case.counted if not result.success_once)
+    return next(numbers, None)
 
 
 def _errors_table(summary: Summary) -> Table:
@@ -346,6 +364,24 @@ def _losses(summary: Summary) -> list[str]:
         )
         lines.append(
             "once with lost: the bounds if all lost episodes had failed, or had been solved"
+        )
+    return lines
+
+
+def _intervals(summary: Summary) -> list[str]:
+    """Return the reasons why intervals are wider than those of as many independent episodes."""
+    lines = []
+    for group in summary.totals:
+        once = group.success_once
+        if once.independent is not None:
+            lines.append(
+                f"{group.policy_id}: {once.episodes + once.lost} episodes repeat initial states, "
+                f"and count as {once.independent:.0f} independent ones"
+            )
+    reasons = summary.reasons_of_sequence
+    if reasons and summary.state != RUNNING:
+        lines.append(
+            f"intervals are confidence sequences, and tests sequential: {', '.join(reasons)}"
         )
     return lines
 

@@ -14,6 +14,7 @@ IDENTITY = ("policy", "checkpoint", "weights")  # names of fields in a policy's 
 # Settings that the field "checkpoint" already covers.
 _OF_CHECKPOINT = {"checkpoint", "checkpoint_step"}
 _SWEPT = "checkpoint: "  # prefix of the names of the files that belong to a step of a sweep
+PLAN = "plan"  # the subject of a change of the plan
 _DIGITS = 12  # number of digits of a digest that are printed
 MIX = (
     "restore the old files, choose a new folder (--out), or mix both, which the report will "
@@ -38,6 +39,11 @@ class Change:
     name: str  # the name of the file or the setting
     was: str | None  # the earlier digest or value; None if there was no value
     now: str | None  # the present digest or value; None if there is no value
+
+    @property
+    def is_of_plan(self) -> bool:
+        """Whether the plan changed, i.e. which episodes were run, not how."""
+        return self.subject == PLAN
 
     def is_statement_of(self, env: str) -> bool:
         """Return whether this is a change of the description or the contract of the env (see

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.errors import ConfigError
@@ -23,10 +23,20 @@ from vlagents_ray.evaluate.results.reader import (
     CaseResults,
     Results,
     by_timing,
+    is_sequential,
     synchronous_twin,
     time_share_of,
 )
-from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
+from vlagents_ray.evaluate.results.statistics import (
+    Pairs,
+    Starts,
+    difference_interval,
+    holm,
+    paired_test,
+    sequential_difference_interval,
+    sequential_test,
+    sum_of,
+)
 from vlagents_ray.naming import did_you_mean
 
 # Settings of the policy, which may differ between compared cases. All other settings belong to the
@@ -45,7 +55,72 @@ OF_POLICY = frozenset(
 )
 ALL = "all"
 
-Strata = dict[str, Pairs]  # keys: envs
+
+class StartPairs(NamedTuple):
+    """The pairs of one start, or of several starts with these outcomes."""
+
+    finished: Pairs  # the pairs that both policies finished
+    # With the pairs in which infrastructure lost an episode, with the outcomes that are worst and
+    # best for A.
+    worst: Pairs
+    best: Pairs
+
+    def __add__(self, other: StartPairs) -> StartPairs:  # type: ignore[override]
+        return StartPairs(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+NO_PAIRS = StartPairs(Pairs(), Pairs(), Pairs())
+Strata = dict[str, dict[str, StartPairs]]  # keys: env, start
+
+
+@dataclass(frozen=True, slots=True)
+class PairedOutcomes:
+    """The outcomes of two policies in the same episodes, one item for each env."""
+
+    strata: tuple[Starts, ...]  # the episodes that both finished
+    # With the lost episodes, with the outcomes that are worst and best for A. What breaks a
+    # simulator may depend on the policy, so nothing is assumed about them.
+    worst: tuple[Starts, ...]
+    best: tuple[Starts, ...]
+    is_sequential: bool  # whether the number of pairs may depend on their outcomes
+
+    @classmethod
+    def from_strata(cls, strata: Iterable[Strata], *, is_sequential: bool) -> PairedOutcomes:
+        """Join the starts of each env, also if several suites have the env."""
+        envs: Strata = {}
+        for stratum in strata:
+            for env, starts in stratum.items():
+                joined = envs.setdefault(env, {})
+                for start, pairs in starts.items():
+                    joined[start] = joined.get(start, NO_PAIRS) + pairs
+
+        completions = []
+        for place in range(len(NO_PAIRS)):
+            counts = [
+                Counter(pairs[place] for pairs in starts.values()) for starts in envs.values()
+            ]
+            for count in counts:
+                del count[Pairs()]
+            completions.append(tuple(counts))
+        finished, worst, best = completions
+        return cls(finished, worst, best, is_sequential)
+
+    @property
+    def p_value(self) -> float:
+        """The largest p-value of `paired_test`, or `sequential_test`, for all outcomes of the lost
+        episodes; 1 if these could change the sign of the difference.
+        """
+        if sum_of(self.worst).net <= 0 <= sum_of(self.best).net:
+            return 1.0
+        test = sequential_test if self.is_sequential else paired_test
+        return max(test(self.worst), test(self.best))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The interval of the difference, for all outcomes of the lost episodes."""
+        interval_of = sequential_difference_interval if self.is_sequential else difference_interval
+        low, high = interval_of(self.worst)
+        return low, high if self.best == self.worst else interval_of(self.best)[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,26 +128,52 @@ class Line:
     """The comparison of two policies on one suite, or on all suites together."""
 
     suite: str  # name of the suite, or "all"
-    strata: tuple[Pairs, ...]  # one item for each env
-    # McNemar's p-value, adjusted with Holm's method for all comparisons of its family.
+    outcomes: PairedOutcomes
+    p_value: float  # see `PairedOutcomes.p_value`
+    # The p-value, adjusted with Holm's method for all comparisons of its family.
     adjusted: float
 
     @property
     def pairs(self) -> Pairs:
-        """The counts for the episodes of all envs together."""
-        return sum(self.strata, Pairs())
+        """The counts for the episodes of all envs together that both policies finished."""
+        return sum_of(self.outcomes.strata)
+
+    @property
+    def lost(self) -> int:
+        """The number of further pairs in which infrastructure lost at least one episode."""
+        return sum_of(self.outcomes.worst).total - self.pairs.total
+
+    @property
+    def starts(self) -> int:
+        """The number of different starts of these pairs."""
+        return sum(sum(starts.values()) for starts in self.outcomes.strata)
+
+    @property
+    def is_sequential(self) -> bool:
+        """Whether the number of pairs may depend on their outcomes (see `is_sequential`)."""
+        return self.outcomes.is_sequential
 
     @property
     def interval(self) -> tuple[float, float]:
-        """(low, high), the 95 % interval of the success rate of A minus the success rate of B (see
-        `difference_interval`).
+        """(low, high), the 95 % interval of the success rate of A minus the success rate of B.
+
+        It contains the intervals for all outcomes of the lost episodes. If `is_sequential`, it is a
+        confidence sequence.
         """
-        return difference_interval(self.strata)
+        return self.outcomes.interval
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields for JSON."""
-        test = {"interval_95": list(self.interval), "p_holm": self.adjusted}
-        return {"suite": self.suite} | self.pairs.to_json() | test
+        interval = "confidence_sequence" if self.is_sequential else "interval_95"
+        return {
+            "suite": self.suite,
+            **self.pairs.to_json(),
+            "starts": self.starts,
+            "lost": self.lost,
+            "p_value": self.p_value,
+            interval: list(self.interval),
+            "p_holm": self.adjusted,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +217,8 @@ def compare(
         a: A policy id: the policy's name, with "@STEP" in a sweep over checkpoints; one of
             `results.policy_ids`.
         b: The other policy id.
-        timing: "synchronous" or "in real time"; required if the results have episodes with both
-            timings, which are never pooled.
+        timing: "synchronous", "in real time" or "on the robot" (see `by_timing`); required if the
+            results have episodes with several timings, which are never pooled.
         accept_changes: Compare even if files, description or contract of an env differ, or if one
             policy ran with several versions of its files or weights.
 
@@ -127,8 +228,8 @@ def compare(
     Raises:
         ConfigError: A policy id is unknown, or the policies share no finished episode, or an env of
             a suite had different settings for both, or a file or the weights changed and
-            `accept_changes` is False, or the policies share episodes of several clocks and `timing`
-            is None.
+            `accept_changes` is False, or the policies share episodes of several timings and
+            `timing` is None.
     """
     if timing is not None:
         timings = by_timing(results.cases)
@@ -160,48 +261,48 @@ def comparisons(
         accept_changes: As in `compare`.
     """
     not_shown = max(0, (chosen_of or 0) - len(policy_pairs))
-    suites_of_pairs: list[dict[str, Strata]] = []
-    changes_of_pairs: list[list[Change]] = []
-    time_shares_of_pairs: list[list[TimeShare | None]] = []
-    for a, b in policy_pairs:
-        suites, changes, compared = _shared(results, a, b, accept_changes=accept_changes)
-        suites_of_pairs.append(suites)
-        changes_of_pairs.append(changes)
-        time_shares_of_pairs.append([_time_share(cases) for cases in zip(*compared, strict=True)])
-
-    strata_of_pairs: list[list[Pairs]] = []
-    names: dict[str, None] = {}  # the names of all suites, in order
-    for suites in suites_of_pairs:
-        names |= dict.fromkeys(suites)
-        strata_of_pairs.append([])
-        for strata in suites.values():
-            strata_of_pairs[-1] += strata.values()
-    totals = _lines(ALL, strata_of_pairs, not_shown)
+    shared = [_shared(results, a, b, accept_changes=accept_changes) for a, b in policy_pairs]
+    # Suites of one env have the same starts, so the totals join them.
+    totals = _lines(
+        ALL,
+        [
+            PairedOutcomes.from_strata(pair.suites.values(), is_sequential=pair.is_sequential)
+            for pair in shared
+        ],
+        not_shown,
+    )
 
     # A pair that shares only one suite has no line for this suite, as the line would repeat the
     # total.
+    names: dict[str, None] = {}  # the names of all suites, in order
+    for pair in shared:
+        names |= dict.fromkeys(pair.suites)
     lines: list[list[Line]] = [[] for _ in policy_pairs]
     for name in names:
         members = []  # indices of the pairs that have a line for this suite
-        strata_of_members = []
-        for index, suites in enumerate(suites_of_pairs):
-            if name in suites and len(suites) > 1:
+        outcomes_of_members = []
+        for index, pair in enumerate(shared):
+            if name in pair.suites and len(pair.suites) > 1:
                 members.append(index)
-                strata_of_members.append(list(suites[name].values()))
-        family = _lines(name, strata_of_members, not_shown)
+                outcomes_of_members.append(
+                    PairedOutcomes.from_strata(
+                        [pair.suites[name]], is_sequential=pair.is_sequential
+                    )
+                )
+        family = _lines(name, outcomes_of_members, not_shown)
         for index, line in zip(members, family, strict=True):
             lines[index].append(line)
 
     compared_pairs = []
     for i, (a, b) in enumerate(policy_pairs):
-        changes, (time_share_a, time_share_b) = changes_of_pairs[i], time_shares_of_pairs[i]
+        time_share_a, time_share_b = map(_time_share, zip(*shared[i].cases, strict=True))
         compared_pairs.append(
             Comparison(
                 a,
                 b,
                 tuple(lines[i]),
                 totals[i],
-                changes=tuple(changes),
+                changes=tuple(shared[i].changes),
                 time_share_a=time_share_a,
                 time_share_b=time_share_b,
             )
@@ -238,26 +339,32 @@ def clock_gaps(results: Results) -> list[Comparison]:
     suite without a counterpart is left out.
     """
     strata: dict[tuple[str, str], Strata] = {}  # keys: (name of A, name of B)
-    cases: dict[tuple[str, str], list[CaseResults]] = {}
+    cases: dict[tuple[str, str], list[tuple[CaseResults, CaseResults]]] = {}
     order = {name: number for number, name in enumerate(results.policy_ids)}
     for case in sorted(results.cases, key=lambda case: order[case.policy_id]):
         counterpart = synchronous_twin(results, case)
         if counterpart is None:
             continue
-        pairs = _pairs(case, counterpart)
-        if pairs.total:
+        starts = _pairs(case, counterpart)
+        if _finished(starts).total:
             names = (
                 f"{case.policy_id}, {case.suite} in real time",
                 f"{case.policy_id}, {counterpart.suite}".rstrip(", "),
             )
-            strata.setdefault(names, {})[case.env] = pairs
-            cases.setdefault(names, []).append(case)
+            strata.setdefault(names, {})[case.env] = starts
+            cases.setdefault(names, []).append((case, counterpart))
 
-    lines = _lines(ALL, [list(by_env.values()) for by_env in strata.values()])
-    return [
-        Comparison(a, b, (), line, tuple(compared), time_share_a=_time_share(compared))
-        for ((a, b), compared), line in zip(cases.items(), lines, strict=True)
+    outcomes = [
+        PairedOutcomes.from_strata([by_env], is_sequential=_are_sequential(cases[names]))
+        for names, by_env in strata.items()
     ]
+    lines = _lines(ALL, outcomes)
+    gaps = []
+    for ((a, b), compared), line in zip(cases.items(), lines, strict=True):
+        in_real_time = tuple(case for case, _ in compared)
+        time_share = _time_share(in_real_time)
+        gaps.append(Comparison(a, b, (), line, in_real_time, time_share_a=time_share))
+    return gaps
 
 
 def gap_to_synchronous(results: Results, case: CaseResults) -> float | None:
@@ -267,7 +374,7 @@ def gap_to_synchronous(results: Results, case: CaseResults) -> float | None:
     It is in [-1, 1]; None if there is no counterpart, or no common episode.
     """
     counterpart = synchronous_twin(results, case)
-    return None if counterpart is None else _pairs(case, counterpart).difference
+    return None if counterpart is None else _finished(_pairs(case, counterpart)).difference
 
 
 def _time_share(cases: Iterable[CaseResults]) -> TimeShare | None:
@@ -275,12 +382,26 @@ def _time_share(cases: Iterable[CaseResults]) -> TimeShare | None:
     return time_share_of(list(itertools.chain.from_iterable(case.counted for case in cases)))
 
 
-def _shared(
-    results: Results, a: str, b: str, *, accept_changes: bool
-) -> tuple[dict[str, Strata], list[Change], list[tuple[CaseResults, CaseResults]]]:
-    """Return the pairs of outcomes by suite and env, the accepted changes between A and B, and the
-    compared cases of A and B.
-    """
+@dataclass(frozen=True, slots=True)
+class _Shared:
+    """The episodes that two policies share."""
+
+    suites: dict[str, Strata]  # the pairs of outcomes by suite
+    changes: list[Change]  # accepted changes between A and B
+    cases: list[tuple[CaseResults, CaseResults]]  # the compared cases of A and B
+
+    @property
+    def is_sequential(self) -> bool:
+        return _are_sequential(self.cases)
+
+
+def _are_sequential(compared: Sequence[tuple[CaseResults, CaseResults]]) -> bool:
+    """Return whether the number of pairs may depend on their outcomes."""
+    return any(is_sequential(cases) for cases in zip(*compared, strict=True))
+
+
+def _shared(results: Results, a: str, b: str, *, accept_changes: bool) -> _Shared:
+    """Return the episodes that A and B share; raises `ConfigError` as `compare` does."""
     unknown = sorted({a, b} - set(results.policy_ids))
     if unknown:
         raise ConfigError(
@@ -299,22 +420,22 @@ def _shared(
         changes |= dict.fromkeys(
             _changes_between(results, case, other, accept_changes=accept_changes)
         )
-        pairs = _pairs(case, other)
-        if pairs.total:
-            suites.setdefault(case.suite, {})[case.env] = pairs
+        starts = _pairs(case, other)
+        if _finished(starts).total:
+            suites.setdefault(case.suite, {})[case.env] = starts
             compared.append((case, other))
 
     timings = by_timing([case for case, _ in compared])
     if len(timings) > 1:
         raise ConfigError(
-            "compare: expected one clock, as episodes of several clocks have no common rate, got "
+            "compare: expected one timing, as episodes of several timings have no common rate, got "
             f"{a!r} and {b!r} with several; choose one: timing={' or '.join(map(repr, timings))}"
         )
     if not suites:
         raise ConfigError(
             f"compare: {a!r} and {b!r} share no finished episode; evaluate both with the same seeds"
         )
-    return suites, list(changes), compared
+    return _Shared(suites, list(changes), compared)
 
 
 _COMPARE_ALL_THE_SAME = "or compare them nevertheless, which the report mentions (--accept-changes)"
@@ -393,23 +514,51 @@ def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]
     return mixed
 
 
-def _pairs(a: CaseResults, b: CaseResults) -> Pairs:
-    """Return the counts of outcomes over the episodes that both cases have, based on success
-    once.
+def _pairs(a: CaseResults, b: CaseResults) -> dict[str, StartPairs]:
+    """Return the outcomes, based on success once, of the episodes that both cases have, by
+    start.
     """
-    counts: Counter[tuple[bool, bool]] = Counter()
-    for episode, solved_by_a in a.solved.items():
-        if episode in b.solved:
-            counts[solved_by_a, b.solved[episode]] += 1
+    # If the same episodes have different starts, e.g. as two machines render them differently, the
+    # coarser division of the episodes is the safer one.
+    keys = a.outcomes.keys() & b.outcomes.keys()
+    starts_of_a = {key: (b if a.outcomes[key] is None else a).starts[key] for key in keys}
+    starts_of_b = {key: (a if b.outcomes[key] is None else b).starts[key] for key in keys}
+    starts = min(starts_of_a, starts_of_b, key=lambda starts: len(set(starts.values())))
+
+    pairs: dict[str, StartPairs] = {}
+    for key in a.outcomes:
+        if key in keys:
+            pair = _PAIRS[a.outcomes[key], b.outcomes[key]]
+            pairs[starts[key]] = pairs.get(starts[key], NO_PAIRS) + pair
+    return pairs
+
+
+def _pair(solved_by_a: bool, solved_by_b: bool) -> Pairs:
     return Pairs(
-        both=counts[True, True],
-        only_a=counts[True, False],
-        only_b=counts[False, True],
-        neither=counts[False, False],
+        both=int(solved_by_a and solved_by_b),
+        only_a=int(solved_by_a and not solved_by_b),
+        only_b=int(solved_by_b and not solved_by_a),
+        neither=int(not solved_by_a and not solved_by_b),
     )
 
 
-def _lines(suite: str, family: Sequence[Sequence[Pairs]], not_shown: int = 0) -> list[Line]:
+# The pairs of one episode, by the outcomes of A and B; None is the outcome of a lost episode.
+_PAIRS = {
+    (a, b): StartPairs(
+        finished=Pairs() if a is None or b is None else _pair(a, b),
+        worst=_pair(bool(a), b is not False),
+        best=_pair(a is not False, bool(b)),
+    )
+    for a, b in itertools.product((True, False, None), repeat=2)
+}
+
+
+def _finished(starts: Mapping[str, StartPairs]) -> Pairs:
+    """Return the counts of the pairs that both policies finished."""
+    return sum((pairs.finished for pairs in starts.values()), Pairs())
+
+
+def _lines(suite: str, family: Sequence[PairedOutcomes], not_shown: int = 0) -> list[Line]:
     """Return the lines of one family.
 
     The comparisons that were left out count as undecided (p = 1). Larger p-values never make Holm's
@@ -418,12 +567,12 @@ def _lines(suite: str, family: Sequence[Sequence[Pairs]], not_shown: int = 0) ->
 
     Args:
         suite: The name of the suite, or "all".
-        family: The strata of each shown member.
+        family: The outcomes of each shown member.
         not_shown: The number of members that were left out because of their outcomes.
     """
-    p_values = [sum(strata, Pairs()).p_value for strata in family]
+    p_values = [outcomes.p_value for outcomes in family]
     adjusted = holm(p_values + [1.0] * not_shown)[: len(p_values)]
     return [
-        Line(suite, tuple(strata), p_value)
-        for strata, p_value in zip(family, adjusted, strict=True)
+        Line(suite, outcomes, p_value, adjusted_p)
+        for outcomes, p_value, adjusted_p in zip(family, p_values, adjusted, strict=True)
     ]

@@ -49,7 +49,8 @@ CREATE TABLE cases (
     described TEXT,
     contract TEXT,
     code TEXT,
-    program TEXT
+    program TEXT,
+    planned_at REAL NOT NULL
 );
 CREATE TABLE episodes (
     key TEXT PRIMARY KEY,
@@ -90,6 +91,7 @@ CREATE TABLE episodes (
     policy_fingerprint TEXT,
     first_policy_version INTEGER,
     actions_sha256 TEXT,
+    start TEXT,
     videos TEXT NOT NULL,
     trajectory TEXT,
     env_program TEXT,

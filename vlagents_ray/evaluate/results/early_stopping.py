@@ -2,7 +2,8 @@
 
 Successful episodes are short and end first, and failures take longest, so the finished episodes are
 a biased sample. Therefore only an unbroken prefix of the planned order counts. The end of a case
-then depends only on the outcomes, not on durations.
+then depends only on the outcomes, not on durations. The decision counts only the first episode of
+each start, as further ones are not independent.
 """
 
 from __future__ import annotations
@@ -61,9 +62,11 @@ class CaseStopping:
         self._stop = stop
         self._seeds = list(seeds)
         self._episodes_per_seed = planned // len(seeds)
-        self._outcomes: dict[int, bool] = {}  # outcomes by index in the plan
+        self._outcomes: dict[int, tuple[bool, str | None]] = {}  # outcome and start, by index
+        self._starts: set[str] = set()  # the starts in the unbroken prefix of the plan
         self._in_order = 0  # the number of episodes in the unbroken prefix of the plan
-        self._successes = 0  # the number of successes in the unbroken prefix
+        # The number of episodes, and of successes, in the prefix with different starts.
+        self._independent = self._successes = 0
         # The number of episodes after which the case stops; None: not decided yet.
         self.at: int | None = None
 
@@ -78,10 +81,15 @@ class CaseStopping:
         """
         index = place_in_plan(result.key, self._seeds, self._episodes_per_seed)
         if index is not None and result.success_once is not None:
-            self._outcomes[index] = result.success_once
+            self._outcomes[index] = result.success_once, result.start
         while self.at is None and self._in_order in self._outcomes:
-            self._successes += self._outcomes[self._in_order]
+            solved, start = self._outcomes[self._in_order]
             self._in_order += 1
+            if start is None or start not in self._starts:
+                self._independent += 1
+                self._successes += solved
+            if start is not None:
+                self._starts.add(start)
             if self._in_order >= self._stop.at_least and self._is_certain():
                 self.at = self._in_order
 
@@ -92,7 +100,7 @@ class CaseStopping:
 
     def _is_certain(self) -> bool:
         """Return whether the interval excludes the target rate, or is narrow enough."""
-        low, high = confidence_sequence(self._successes, self._in_order, self._stop.error_rate)
+        low, high = confidence_sequence(self._successes, self._independent, self._stop.error_rate)
         target, width = self._stop.target, self._stop.width
         excludes_target = target is not None and not low <= target <= high
         is_narrow = width is not None and high - low < width

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -28,7 +30,13 @@ from vlagents_ray.evaluate.results.database import (
     require_readable,
 )
 from vlagents_ray.evaluate.results.early_stopping import CaseStopping, place_in_plan
-from vlagents_ray.evaluate.results.statistics import Rate, median, pooled
+from vlagents_ray.evaluate.results.statistics import (
+    ERROR_RATE,
+    Rate,
+    independent_episodes,
+    median,
+    pooled,
+)
 
 KILLED = "killed"  # state of a run that was killed before it recorded an end
 
@@ -123,6 +131,9 @@ class CaseResults:
     stop: StopConfig | None = None  # the rule for stopping the case early
     # The number of episodes after which the case stopped; later episodes are kept, but not counted.
     stopped_at: int | None = None
+    # The time at which the number of planned episodes, or the rule for stopping early, was last
+    # chosen, s since 1970.
+    planned_at: float = 0.0
 
     @property
     def policy_id(self) -> str:
@@ -149,12 +160,35 @@ class CaseResults:
         return tuple(episode.result for episode in self.counted_episodes)
 
     @cached_property
-    def solved(self) -> dict[tuple[int, int], bool]:
-        """Success once of each episode that the rates include, by number and seed."""
-        return {
-            (result.key.episode, result.key.seed): bool(result.success_once)
-            for result in self.counted
-        }
+    def outcomes(self) -> dict[tuple[int, int], bool | None]:
+        """Success once of each planned episode with a record, by number and seed; None if
+        infrastructure lost the episode.
+        """
+        outcomes = {}
+        for episode in self.episodes:
+            if not episode.beyond:
+                key = episode.result.key
+                solved = bool(episode.result.success_once) if episode.counts else None
+                outcomes[key.episode, key.seed] = solved
+        return outcomes
+
+    @cached_property
+    def starts(self) -> dict[tuple[int, int], str]:
+        """The start of each episode in `outcomes`, by number and seed: a name of its initial state.
+        An episode without a recorded start is the only one of its start.
+        """
+        starts = {}
+        for episode in self.episodes:
+            if not episode.beyond:
+                result = episode.result
+                start = result.start or f"seed {result.key.seed}"
+                starts[result.key.episode, result.key.seed] = start
+        return starts
+
+    @property
+    def lost(self) -> int:
+        """The number of episodes that infrastructure lost, which the rates exclude."""
+        return sum(solved is None for solved in self.outcomes.values())
 
     @property
     def missing(self) -> int:
@@ -409,32 +443,83 @@ def rate_of(
     cases: Sequence[CaseResults], outcome: Literal["success_once", "success_at_end"]
 ) -> Rate:
     """Return the success rate of one case, or of several together, with bounds that are valid if
-    cases could stop early.
+    the number of episodes may depend on their outcomes.
 
     For cases without a common rate (see `have_common_rate`), the counts are summed, but the rate is
     None.
     """
-    counts = []  # (successes, episodes) of each case
+    rates = []
     for case in cases:
         solved = sum(bool(getattr(result, outcome)) for result in case.counted)
-        counts.append((solved, len(case.counted)))
-    successes = sum(solved for solved, _ in counts)
-    episodes = sum(number for _, number in counts)
+        rates.append(
+            Rate(solved, len(case.counted), lost=case.lost, independent=_independent([case]))
+        )
 
-    share_a_rate = have_common_rate(cases)
-    error_rates = [case.stop.error_rate for case in cases if case.stop is not None]
-    if not error_rates:
-        return Rate(successes, episodes, pooled=share_a_rate)
-    error_rate = max(error_rates)
-    return Rate(successes, episodes, pooled(counts, error_rate), error_rate, share_a_rate)
+    bounds = error_rate = None
+    if is_sequential(cases):
+        rules = [case.stop.error_rate for case in cases if case.stop is not None]
+        error_rate = max(rules, default=ERROR_RATE)
+        bounds = pooled(rates, error_rate)
+    return Rate(
+        sum(rate.successes for rate in rates),
+        sum(rate.episodes for rate in rates),
+        bounds,
+        error_rate,
+        have_common_rate(cases),
+        sum(rate.lost for rate in rates),
+        _independent(cases),
+    )
+
+
+def _independent(cases: Iterable[CaseResults]) -> float | None:
+    """Return the number of independent episodes in the cases, with the lost ones; None if no start
+    is repeated. Cases of one policy id in one env have the same starts, also in several suites.
+    """
+    repeats: Counter[tuple[str, str, str]] = Counter()
+    for case in cases:
+        repeats.update((case.policy_id, case.env, start) for start in case.starts.values())
+    if all(number == 1 for number in repeats.values()):
+        return None
+    return independent_episodes(repeats.values())
+
+
+def is_sequential(cases: Sequence[CaseResults]) -> bool:
+    """Return whether the number of episodes of the cases may depend on their outcomes."""
+    return bool(reasons_of_sequence(cases))
+
+
+def reasons_of_sequence(cases: Sequence[CaseResults]) -> list[str]:
+    """Return the reasons why the number of episodes of the cases may depend on their outcomes;
+    empty if the number was chosen before the first outcome.
+    """
+    by_policy_id: dict[str, list[CaseResults]] = {}
+    for case in cases:
+        by_policy_id.setdefault(case.policy_id, []).append(case)
+
+    reasons = []
+    if any(case.stop is not None for case in cases):
+        reasons.append("cases could stop early")
+    if any(case.stop is None and len(case.outcomes) < case.planned for case in cases):
+        reasons.append("planned episodes have no result yet")
+    if any(map(_was_planned_late, by_policy_id.values())):
+        reasons.append("the plan changed after the first results")
+    return reasons
+
+
+def _was_planned_late(cases: Sequence[CaseResults]) -> bool:
+    """Return whether a case of a policy id was planned, or its number of episodes was changed,
+    after the first result of this policy id.
+    """
+    finished = [episode.finished for case in cases for episode in case.episodes]
+    return max(case.planned_at for case in cases) > min(finished, default=math.inf)
 
 
 def have_common_rate(cases: Sequence[CaseResults]) -> bool:
     """Return whether one rate may be computed over the episodes of these cases.
 
     Cases that stopped after different numbers of episodes have no common rate, since their outcomes
-    would determine their weights. Cases with different clocks have no common rate, since success in
-    real time differs from success while the env waits.
+    would determine their weights. Cases with different timings have no common rate (see
+    `by_timing`): success in real time or on a robot differs from success while the env waits.
     """
     return len({case.stopped_at for case in cases}) <= 1 and len(by_timing(cases)) <= 1
 
@@ -457,26 +542,38 @@ def time_share_of(results: Sequence[EpisodeResult]) -> TimeShare | None:
     )
 
 
-SYNCHRONOUS, REAL_TIME = "synchronous", "in real time"
+SYNCHRONOUS, REAL_TIME, ON_ROBOT = "synchronous", "in real time", "on the robot"
 
 
 def by_timing(cases: Sequence[CaseResults]) -> dict[str, list[CaseResults]]:
-    """Group the cases by their clock: first "synchronous", then "in real time", with a separate
-    group for each clock if there are several.
-    """
-    synchronous = [case for case in cases if case.settings.get("clock") is None]
-    clocks: dict[str, list[CaseResults]] = {}  # cases in real time, by the settings of their clock
-    for case in cases:
-        clock = case.settings.get("clock")
-        if clock is not None:
-            clocks.setdefault(json.dumps(clock, sort_keys=True), []).append(case)
+    """Group the cases by what happens while the policy computes: first "synchronous", then "in real
+    time", then "on the robot".
 
-    groups = {SYNCHRONOUS: synchronous} if synchronous else {}
-    for members in clocks.values():
-        suites = ", ".join(dict.fromkeys(case.suite or "the nameless suite" for case in members))
-        name = REAL_TIME if len(clocks) == 1 else f"{REAL_TIME} ({suites})"
-        groups[name] = members
-    return groups
+    Each clock and each robot, with its control loop, has a separate group if there are several.
+    """
+    groups: dict[str, dict[str, list[CaseResults]]] = {SYNCHRONOUS: {}, REAL_TIME: {}, ON_ROBOT: {}}
+    for case in cases:
+        timing, settings = _timing(case)
+        members = groups[timing].setdefault(json.dumps(settings, sort_keys=True), [])
+        members.append(case)
+
+    named = {}
+    for timing, alike in groups.items():
+        for number, members in enumerate(alike.values(), 1):
+            suites = dict.fromkeys(case.suite or "the nameless suite" for case in members)
+            name = timing if len(alike) == 1 else f"{timing} ({', '.join(suites)})"
+            if name in named:  # suites of several folders may have one name
+                name = f"{timing} ({', '.join(suites)}, {number})"
+            named[name] = members
+    return named
+
+
+def _timing(case: CaseResults) -> tuple[str, Any]:
+    """Return the timing of a case, and its settings."""
+    robot, clock = case.settings.get("robot"), case.settings.get("clock")
+    if robot is not None:
+        return ON_ROBOT, {name: value for name, value in robot.items() if name != "task"}
+    return (SYNCHRONOUS, None) if clock is None else (REAL_TIME, clock)
 
 
 def synchronous_twin(results: Results, case: CaseResults) -> CaseResults | None:
@@ -491,7 +588,7 @@ def synchronous_twin(results: Results, case: CaseResults) -> CaseResults | None:
         The case in which the env waited for the policy; None if there is no such case, or if `case`
         itself is synchronous.
     """
-    if case.settings["clock"] is None:
+    if _timing(case)[0] != REAL_TIME:
         return None
     settings = case.settings | {"clock": None}
     return next((twin for twin in results.cases if twin.settings == settings), None)

@@ -26,6 +26,7 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan
 from vlagents_ray.evaluate.results.changes import (
     MIX,
+    PLAN,
     Change,
     EnvStatement,
     changed,
@@ -105,14 +106,74 @@ class Store(AbstractContextManager["Store"]):
             self._plan.settings.model_dump_json(),
             canonical(versions),
         )
-        programs = [(canonical(case.program), case.fingerprint) for case in self.cases]
         with self._db:
+            # Before the first row of this run, which changes what the plan is compared with.
+            self._changes += self._growth()
+            self._plan_cases(row[0])
             cursor = self._db.execute(
                 "INSERT INTO runs (started, state, config, versions) VALUES (?, ?, ?, ?)", row
             )
             self._run = int(cursor.lastrowid or 0)
             self._write_changes()
-            self._db.executemany("UPDATE cases SET program = ? WHERE case_id = ?", programs)
+
+    def _plan_cases(self, now: float) -> None:
+        """Write the cases of the plan; `now` is the time of the plan, s since 1970."""
+        stop = self._stopping_rule()
+        for case in self.cases:
+            row = {
+                "case_id": case.fingerprint,
+                "policy": case.policy.name,
+                "step": case.step,
+                "suite": case.suite.name,
+                "env": case.env,
+                "settings": canonical(case.settings),
+                "planned": case.planned,
+                "seeds": canonical(case.suite.seeds),
+                "stop": stop,
+                "program": canonical(case.program),
+                "planned_at": now,
+            }
+            self._db.execute(
+                "INSERT INTO cases (case_id, policy, step, suite, env, settings, planned, seeds, "
+                "stop, program, planned_at) VALUES (:case_id, :policy, :step, :suite, :env, "
+                ":settings, :planned, :seeds, :stop, :program, :planned_at) ON CONFLICT DO UPDATE "
+                "SET planned_at = CASE WHEN planned = :planned AND seeds = :seeds AND stop IS "
+                ":stop THEN planned_at ELSE :planned_at END, planned = :planned, seeds = :seeds, "
+                "stop = :stop, program = :program",
+                row,
+            )
+
+    def _growth(self) -> list[Change]:
+        """Return the episodes and cases that the plan adds to policy ids that have results.
+
+        They are accepted, but recorded: one could add episodes until the result looks good.
+        """
+        with_results = set(
+            self._db.execute(
+                "SELECT DISTINCT c.policy, c.step FROM episodes e JOIN cases c ON c.case_id = "
+                "e.case_id"
+            )
+        )
+        changes = []
+        for case in self.cases:
+            if (case.policy.name, case.step) not in with_results:
+                continue
+            name = " ".join(filter(None, case.name))
+            row = self._db.execute(
+                "SELECT planned, seeds FROM cases WHERE case_id = ?", (case.fingerprint,)
+            ).fetchone()
+            if row is None:
+                changes.append(Change(PLAN, name, None, "in it"))
+                continue
+            planned, seeds = row[0], json.loads(row[1])
+            episodes = planned // len(seeds)
+            if case.suite.episodes > episodes:
+                now = str(case.suite.episodes)
+                changes.append(Change(PLAN, f"{name}: episodes", str(episodes), now))
+            if len(case.suite.seeds) > len(seeds):
+                now = str(case.suite.seeds)
+                changes.append(Change(PLAN, f"{name}: seeds", str(seeds), now))
+        return changes
 
     def end_run(self, state: str) -> None:
         """Record that the run ends now, in one of the states of `Run.state`."""
@@ -377,29 +438,6 @@ class Store(AbstractContextManager["Store"]):
                 create(db)
             require_readable(self.out, db)
             self._require_resumable(db)
-
-            stop = self._stopping_rule()
-            with db:
-                for case in self.cases:
-                    row = {
-                        "case_id": case.fingerprint,
-                        "policy": case.policy.name,
-                        "step": case.step,
-                        "suite": case.suite.name,
-                        "env": case.env,
-                        "settings": canonical(case.settings),
-                        "planned": case.planned,
-                        "seeds": canonical(case.suite.seeds),
-                        "stop": stop,
-                        "program": canonical(case.program),
-                    }
-                    db.execute(
-                        "INSERT INTO cases (case_id, policy, step, suite, env, settings, planned, "
-                        "seeds, stop, program) VALUES (:case_id, :policy, :step, :suite, :env, "
-                        ":settings, :planned, :seeds, :stop, :program) ON CONFLICT DO UPDATE SET "
-                        "planned = :planned, seeds = :seeds, stop = :stop",
-                        row,
-                    )
         except BaseException:
             db.close()
             raise
@@ -446,7 +484,7 @@ class Store(AbstractContextManager["Store"]):
             )
 
         self._accept_or_raise(
-            "plan",
+            PLAN,
             self._other_plan(db),
             "this plan differs from the plan of the results in",
             "plan all of it; choose a new folder (--out); or continue with this plan, which the "
@@ -477,7 +515,8 @@ class Store(AbstractContextManager["Store"]):
         """Return the cases and episodes of the results that this plan lacks, and changed rules of
         early stopping.
 
-        A plan may grow; for example, `--watch` adds one step of a policy after another. A trainer
+        A plan may grow (see `_growth`); for example, `--watch` adds one step of a policy after
+        another. A trainer
         evaluates the versions of its policies one after another into one folder, and each plan
         contains only the cases of one policy. So the cases of other policies do not count as
         missing.
@@ -494,7 +533,7 @@ class Store(AbstractContextManager["Store"]):
             is_expected = policy in policies or not is_training
             if is_expected and (policy, suite, env) not in planned:
                 name = " ".join(filter(None, (policy, suite, env)))
-                changes.append(Change("plan", name, "in it", None))
+                changes.append(Change(PLAN, name, "in it", None))
 
         rule = self._stopping_rule()
         query = "SELECT planned, seeds, stop FROM cases WHERE case_id = ?"
@@ -535,11 +574,11 @@ def _plan_changes(
     name = " ".join(filter(None, case.name))
     changes = []
     if case.suite.episodes < episodes:
-        changes.append(Change("plan", f"{name}: episodes", str(episodes), str(case.suite.episodes)))
+        changes.append(Change(PLAN, f"{name}: episodes", str(episodes), str(case.suite.episodes)))
     if len(case.suite.seeds) < len(seeds):
-        changes.append(Change("plan", f"{name}: seeds", str(seeds), str(case.suite.seeds)))
+        changes.append(Change(PLAN, f"{name}: seeds", str(seeds), str(case.suite.seeds)))
     if stop != rule:
-        changes.append(Change("plan", f"{name}: early stopping", str(stop), str(rule)))
+        changes.append(Change(PLAN, f"{name}: early stopping", str(stop), str(rule)))
     return changes
 
 

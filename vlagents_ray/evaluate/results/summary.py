@@ -16,11 +16,13 @@ from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.results.comparison import gap_to_synchronous
 from vlagents_ray.evaluate.results.reader import (
+    SYNCHRONOUS,
     CaseResults,
     Results,
     by_timing,
     have_common_rate,
     rate_of,
+    reasons_of_sequence,
     time_share_of,
 )
 from vlagents_ray.evaluate.results.statistics import Rate, median
@@ -57,7 +59,8 @@ class Group:
     env_step_ms: float | None  # median of the episodes' medians
     policy_ms: float | None  # median of the episodes' medians
     policy_p95_ms: float | None  # median of the episodes' 95th percentiles
-    time_share: TimeShare | None  # see `time_share_of`
+    # See `time_share_of`; None for cases of several clocks or robots.
+    time_share: TimeShare | None
 
     @property
     def episodes(self) -> int:
@@ -123,15 +126,23 @@ class Summary:
         return group_of((TOTAL, "", TOTAL), self.results.cases)
 
     def parts(self, policy_id: str) -> dict[str, Group]:
-        """Return the totals of a policy id for each clock of its episodes (see `by_timing`)."""
+        """Return the totals of a policy id for each timing of its episodes (see `by_timing`)."""
         return {
             timing: group_of((policy_id, "", TOTAL), cases)
             for timing, cases in by_timing(self.results.of(policy_id)).items()
         }
 
     @property
+    def reasons_of_sequence(self) -> list[str]:
+        """The reasons why intervals are confidence sequences (see `reasons_of_sequence`)."""
+        reasons: list[str] = []
+        for cases in by_timing(self.results.cases).values():
+            reasons += reasons_of_sequence(cases)
+        return list(dict.fromkeys(reasons))
+
+    @property
     def has_one_rate_each(self) -> bool:
-        """Whether each policy id has a common rate for all its cases with the same clock."""
+        """Whether each policy id has a common rate for all its cases with the same timing."""
         for policy_id in self.results.policy_ids:
             groups = self.parts(policy_id).values()
             if not all(group.success_once.pooled for group in groups):
@@ -141,10 +152,9 @@ class Summary:
     @property
     def best(self) -> list[str]:
         """The policy ids, best first, sorted by the mean success rate of their cases with the same
-        clock.
+        timing.
 
-        The clock is the first one in `by_timing`: the synchronous clock, if there are synchronous
-        episodes.
+        The timing is the first one in `by_timing`: "synchronous", if there are such episodes.
         """
         rates: dict[str, list[float]] = {name: [] for name in self.results.policy_ids}
         timings = list(by_timing(self.results.cases).values())
@@ -204,6 +214,7 @@ class Summary:
             "policy_busy": self.policy_busy,
             "transports": self.transports,
             "accepted_changes": [asdict(change) for change in self.results.accepted_changes],
+            "confidence_sequences": self.reasons_of_sequence,
             "policies": self.results.policies,
             "versions": last_run.versions,
             "config": last_run.config,
@@ -337,6 +348,7 @@ def group_of(name: tuple[str, str, str], cases: Sequence[CaseResults]) -> Group:
             if episode.result.status == "infra_failed" and not episode.beyond:
                 infra_failures += 1
 
+    timings = by_timing(cases).keys() - {SYNCHRONOUS}
     steps = [result.steps for result in finished]
     mean_steps = mean_return = None
     if finished and have_common_rate(cases):
@@ -358,7 +370,7 @@ def group_of(name: tuple[str, str, str], cases: Sequence[CaseResults]) -> Group:
         env_step_ms=median(result.env_step_ms for result in finished),
         policy_ms=median(result.policy_ms for result in finished),
         policy_p95_ms=median(result.policy_p95_ms for result in finished),
-        time_share=time_share_of(finished),
+        time_share=time_share_of(finished) if len(timings) <= 1 else None,
     )
 
 
