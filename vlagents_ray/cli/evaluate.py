@@ -139,7 +139,7 @@ class EvalOptions:
         str | None,
         typer.Option(
             metavar="none|failures|all",
-            help="Episodes whose video is written; default: failures.",
+            help="Episodes whose video is written; default: none.",
         ),
     ] = None
     record: Annotated[

@@ -473,8 +473,10 @@ class EvalConfig(_PlanModel):
         "otherwise 1.",
     )
     video: EpisodeChoice = Field(
-        default="failures",
-        description="Episodes whose video is written.",
+        # A video needs the images of each step, whose rendering in software takes two to four times
+        # the CPU time of the episode.
+        default="none",
+        description="Episodes whose video is written, which needs the images of each step.",
     )
     record: EpisodeChoice = Field(
         default="none",
