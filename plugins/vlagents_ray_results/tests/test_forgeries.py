@@ -111,6 +111,7 @@ UNKNOWN = {
     "revision": "known only on machines with the weights in the hub's cache; affects no success "
     "rate",
     "videos": "a bundle has videos only on request; they are for viewing",
+    "start": "the initial state as the environment showed it; affects intervals only",
 }
 # By array of a recording: a change that keeps the array's shape.
 CHANGED_ARRAYS: dict[str, Callable[[Trajectory], object]] = {
