@@ -410,7 +410,7 @@ def compare_runs(
                 gains.append(pairs.difference)
                 print(
                     f"{folder}, within {ticks} ticks: {before / pairs.total:.1%} before, "
-                    f"{after / pairs.total:.1%} after, of {pairs.total}; p {pairs.p_value:.2g}"
+                    f"{after / pairs.total:.1%} after, of {pairs.total}; p {total.p_value:.2g}"
                 )
             if len(gains) > 1:
                 print(

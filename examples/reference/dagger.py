@@ -172,7 +172,7 @@ def compare_after(
         f"{pairs.total}"
     )
     typer.echo(
-        f"difference {pairs.difference:+.1%} [{low:+.1%}, {high:+.1%}], p {pairs.p_value:.2g}"
+        f"difference {pairs.difference:+.1%} [{low:+.1%}, {high:+.1%}], p {total.p_value:.2g}"
     )
 
 

@@ -216,6 +216,7 @@ def test_only_what_was_asked_for_now_is_missed(
     suite = SuiteConfig(envs=["tabletop"], name="b", seeds=[9])
     other = config.model_copy(update={"resume": True, "accept_changes": True, "suites": [suite]})
     with Store(resolve(other)) as store:
+        store.begin_run({})
         for job in plan_jobs(store.cases):
             store.record(EpisodeResult(job.key, "done", True, True, 3), 1)
     assert end_of(other, monkeypatch) == (0, "")

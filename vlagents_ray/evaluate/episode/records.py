@@ -18,6 +18,7 @@ Status = Literal["done", "policy_error", "infra_failed"]
 Ending = Literal["terminated", "truncated", "policy_done", "error"]
 
 _DIGITS = 16  # number of digits of a digest in a key
+INIT_STATE = "init_state "  # beginning of the name of a start that the benchmark numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +159,7 @@ def start_of(obs: Obs, instruction: str, options: Mapping[str, Any] | None) -> s
     """
     state = (options or {}).get("init_state")
     if isinstance(state, int | np.integer):
-        return f"init_state {state}"
+        return f"{INIT_STATE}{state}"
 
     digest = hashlib.sha256(instruction.encode())
     named = [("gripper", obs.gripper), *obs.state.items(), *obs.cameras.items()]

@@ -23,7 +23,7 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
 from vlagents_ray.evaluate.results.reader import CaseResults
-from vlagents_ray.evaluate.results.statistics import Rate, confidence_sequence
+from vlagents_ray.evaluate.results.statistics import Rate
 from vlagents_ray.evaluate.results.summary import (
     Group,
     Summary,
@@ -118,11 +118,7 @@ class _CountedProgress(Progress):
 
         before = self._rates[case.fingerprint]
         successes = before.successes + bool(result.success_once)
-        episodes = before.episodes + 1
-        bounds = None
-        if before.error_rate is not None:  # at most: the case may stop early
-            bounds = confidence_sequence(successes, episodes, before.error_rate)
-        self._rates[case.fingerprint] = Rate(successes, episodes, bounds, before.error_rate)
+        self._rates[case.fingerprint] = Rate(successes, before.episodes + 1)
 
         if result.status == "policy_error":
             error = (result.error or "").strip().partition("\n")[0]
@@ -159,11 +155,13 @@ class _CountedProgress(Progress):
         for case_id, case in self._cases.items():
             rate = self._rates[case_id]
             done = rate.episodes + self._infra_failed[case_id]
+            # Without an interval: episodes that end early are a biased sample.
+            so_far = "-" if rate.rate is None else f"{rate.rate:.0%}"
             is_being_played = 0 < done < case.planned
             if len(rows) < MOST_ROWS and (show_all or is_being_played):
                 policy_id, suite, env = case.name
                 names = (suite, env) if self._is_one_policy else (policy_id, suite, env)
-                rows.append((" ".join(filter(None, names)), f"{done}/{case.planned}", str(rate)))
+                rows.append((" ".join(filter(None, names)), f"{done}/{case.planned}", so_far))
         return rows
 
     def _overall(self) -> str:

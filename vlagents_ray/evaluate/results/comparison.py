@@ -345,13 +345,13 @@ def clock_gaps(results: Results) -> list[Comparison]:
         counterpart = synchronous_twin(results, case)
         if counterpart is None:
             continue
-        starts = _pairs(case, counterpart)
-        if _finished(starts).total:
+        pairs = _pairs(case, counterpart, results.starts)
+        if _finished(pairs).total:
             names = (
                 f"{case.policy_id}, {case.suite} in real time",
                 f"{case.policy_id}, {counterpart.suite}".rstrip(", "),
             )
-            strata.setdefault(names, {})[case.env] = starts
+            strata.setdefault(names, {})[case.env] = pairs
             cases.setdefault(names, []).append((case, counterpart))
 
     outcomes = [
@@ -374,7 +374,10 @@ def gap_to_synchronous(results: Results, case: CaseResults) -> float | None:
     It is in [-1, 1]; None if there is no counterpart, or no common episode.
     """
     counterpart = synchronous_twin(results, case)
-    return None if counterpart is None else _finished(_pairs(case, counterpart)).difference
+    if counterpart is None:
+        return None
+    pairs = _pairs(case, counterpart, results.starts)
+    return _finished(pairs).difference
 
 
 def _time_share(cases: Iterable[CaseResults]) -> TimeShare | None:
@@ -420,9 +423,9 @@ def _shared(results: Results, a: str, b: str, *, accept_changes: bool) -> _Share
         changes |= dict.fromkeys(
             _changes_between(results, case, other, accept_changes=accept_changes)
         )
-        starts = _pairs(case, other)
-        if _finished(starts).total:
-            suites.setdefault(case.suite, {})[case.env] = starts
+        pairs = _pairs(case, other, results.starts)
+        if _finished(pairs).total:
+            suites.setdefault(case.suite, {})[case.env] = pairs
             compared.append((case, other))
 
     timings = by_timing([case for case, _ in compared])
@@ -514,22 +517,25 @@ def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]
     return mixed
 
 
-def _pairs(a: CaseResults, b: CaseResults) -> dict[str, StartPairs]:
-    """Return the outcomes, based on success once, of the episodes that both cases have, by
-    start.
+def _pairs(
+    a: CaseResults, b: CaseResults, starts: Mapping[str, Mapping[tuple[int, int], str]]
+) -> dict[str, StartPairs]:
+    """Return the outcomes, based on success once, of the episodes that both cases have, by start;
+    `starts` is `Results.starts`.
     """
     # If the same episodes have different starts, e.g. as two machines render them differently, the
     # coarser division of the episodes is the safer one.
     keys = a.outcomes.keys() & b.outcomes.keys()
-    starts_of_a = {key: (b if a.outcomes[key] is None else a).starts[key] for key in keys}
-    starts_of_b = {key: (a if b.outcomes[key] is None else b).starts[key] for key in keys}
-    starts = min(starts_of_a, starts_of_b, key=lambda starts: len(set(starts.values())))
+    of_a, of_b = starts[a.case_id], starts[b.case_id]
+    starts_of_a = {key: (of_b if a.outcomes[key] is None else of_a)[key] for key in keys}
+    starts_of_b = {key: (of_a if b.outcomes[key] is None else of_b)[key] for key in keys}
+    names = min(starts_of_a, starts_of_b, key=lambda names: len(set(names.values())))
 
     pairs: dict[str, StartPairs] = {}
     for key in a.outcomes:
         if key in keys:
             pair = _PAIRS[a.outcomes[key], b.outcomes[key]]
-            pairs[starts[key]] = pairs.get(starts[key], NO_PAIRS) + pair
+            pairs[names[key]] = pairs.get(names[key], NO_PAIRS) + pair
     return pairs
 
 

@@ -17,7 +17,7 @@ from typing import Any, Literal
 from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import inside, require_below
-from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
+from vlagents_ray.evaluate.episode.records import INIT_STATE, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import policy_id
 from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
@@ -172,19 +172,6 @@ class CaseResults:
                 outcomes[key.episode, key.seed] = solved
         return outcomes
 
-    @cached_property
-    def starts(self) -> dict[tuple[int, int], str]:
-        """The start of each episode in `outcomes`, by number and seed: a name of its initial state.
-        An episode without a recorded start is the only one of its start.
-        """
-        starts = {}
-        for episode in self.episodes:
-            if not episode.beyond:
-                result = episode.result
-                start = result.start or f"seed {result.key.seed}"
-                starts[result.key.episode, result.key.seed] = start
-        return starts
-
     @property
     def lost(self) -> int:
         """The number of episodes that infrastructure lost, which the rates exclude."""
@@ -287,6 +274,11 @@ class Results:
 
         ordered = sorted(self.cases, key=rank)
         return tuple(dict.fromkeys(case.policy_id for case in ordered))
+
+    @cached_property
+    def starts(self) -> dict[str, dict[tuple[int, int], str]]:
+        """The start of each episode (see `starts_of`)."""
+        return starts_of(self.cases)
 
     def of(self, policy_id: str) -> list[CaseResults]:
         """Return the cases of one policy id, in the order of the plan."""
@@ -471,16 +463,50 @@ def rate_of(
     )
 
 
-def _independent(cases: Iterable[CaseResults]) -> float | None:
+def _independent(cases: Sequence[CaseResults]) -> float | None:
     """Return the number of independent episodes in the cases, with the lost ones; None if no start
     is repeated. Cases of one policy id in one env have the same starts, also in several suites.
     """
     repeats: Counter[tuple[str, str, str]] = Counter()
+    starts = starts_of(cases)
     for case in cases:
-        repeats.update((case.policy_id, case.env, start) for start in case.starts.values())
+        names = starts[case.case_id].values()
+        repeats.update((case.policy_id, case.env, start) for start in names)
     if all(number == 1 for number in repeats.values()):
         return None
     return independent_episodes(repeats.values())
+
+
+def starts_of(cases: Iterable[CaseResults]) -> dict[str, dict[tuple[int, int], str]]:
+    """Return the start of each episode in `CaseResults.outcomes`, by number and seed, for each
+    case id.
+
+    The start is the number of the initial state, if the environment has a fixed number of states.
+    Otherwise it is the lowest seed whose first observation is the same, so that a seed also has
+    one start if two suites render it differently. An episode without a recorded start has its seed.
+    """
+    cases = list(cases)
+    lowest_seeds: dict[tuple[str, str], int] = {}  # by env and first observation
+    for result in itertools.chain.from_iterable(map(_planned_results, cases)):
+        if result.start is not None:
+            place = result.key.env, result.start
+            lowest_seeds[place] = min(result.key.seed, lowest_seeds.get(place, result.key.seed))
+
+    starts_of_cases = {}
+    for case in cases:
+        starts = {}
+        for result in _planned_results(case):
+            start = result.start
+            if start is None or not start.startswith(INIT_STATE):
+                place = result.key.env, start or ""
+                start = f"seed {lowest_seeds.get(place, result.key.seed)}"
+            starts[result.key.episode, result.key.seed] = start
+        starts_of_cases[case.case_id] = starts
+    return starts_of_cases
+
+
+def _planned_results(case: CaseResults) -> Iterator[EpisodeResult]:
+    return (episode.result for episode in case.episodes if not episode.beyond)
 
 
 def is_sequential(cases: Sequence[CaseResults]) -> bool:

@@ -212,7 +212,7 @@ class Pairs:
 
     @property
     def starts(self) -> Starts:
-        """These pairs, each with a start of its own."""
+        """The starts of these pairs, if no start is repeated."""
         return Counter(
             {
                 Pairs(both=1): self.both,

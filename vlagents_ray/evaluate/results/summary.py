@@ -152,14 +152,15 @@ class Summary:
     @property
     def best(self) -> list[str]:
         """The policy ids, best first, sorted by the mean success rate of their cases with the same
-        timing.
+        timing, in which lost episodes count as failures.
 
         The timing is the first one in `by_timing`: "synchronous", if there are such episodes.
         """
         rates: dict[str, list[float]] = {name: [] for name in self.results.policy_ids}
         timings = list(by_timing(self.results.cases).values())
         for case in timings[0] if timings else []:
-            rates[case.policy_id].append(rate_of([case], "success_once").rate or 0.0)
+            once = rate_of([case], "success_once")
+            rates[case.policy_id].append(once.successes / max(1, once.episodes + once.lost))
 
         means = {}
         for name, values in rates.items():
