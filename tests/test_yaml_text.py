@@ -130,3 +130,31 @@ def test_no_other_module_reads_yaml() -> None:
             ):
                 readers.add(file.relative_to(folder).as_posix())
     assert readers == {"yaml_text.py"}
+
+
+BOMB = "\n".join(
+    ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    + [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 8)]
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (BOMB, "aliases .* stand for more than 10000 values"),
+        ("a: &a [*a]", "names a value that contains it"),
+        ("a: &a {b: [1, {c: *a}]}", "names a value that contains it"),
+        ("a: &a {<<: *a}", "names a value that contains it"),
+    ],
+)
+def test_aliases_must_not_make_a_document_large(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_yaml(text)
+
+
+def test_ordinary_aliases_and_large_documents_are_read() -> None:
+    assert load_yaml("a: &a {b: 1}\nc: {<<: *a, d: *a}") == {
+        "a": {"b": 1},
+        "c": {"b": 1, "d": {"b": 1}},
+    }
+    assert len(load_yaml("\n".join(f"- {n}" for n in range(20_000)))) == 20_000

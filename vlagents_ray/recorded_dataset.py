@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -32,14 +33,17 @@ from vlagents_ray.datasets.episode import (
     TICK_COLUMN,
 )
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.foreign_files import existing_file, fill_template, read_text
 from vlagents_ray.images import jpeg_png
-from vlagents_ray.images.mp4 import rgb_converter
+from vlagents_ray.images.mp4 import read_mp4, rgb_converter
 from vlagents_ray.interface import CAPTURED, Obs
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
 from vlagents_ray.protocol.values import from_text
 from vlagents_ray.registry import require
 
+_FOLDER = "the dataset"
+_INFO_FILE = "meta/info.json"
 _IMAGE_DTYPES = ("video", "image")
 
 
@@ -97,9 +101,8 @@ class RecordedDataset:
         """
         self.root = root
         self._pq: Any = require("pyarrow.parquet")
-        self._av: Any = require("av")
 
-        self.info = _read_info(root / "meta/info.json")
+        self.info = _read_info(root / _INFO_FILE, self._text(_INFO_FILE))
         self.version = str(self.info.get("codebase_version"))
         if not self.version.startswith(("v3.", "v2.")):
             raise ConfigError(
@@ -235,11 +238,12 @@ class RecordedDataset:
         """Read the episodes from the metadata, in the order of their indices."""
         rows: list[dict[str, Any]] = []
         if self.version.startswith("v2."):
-            lines = (self.root / "meta/episodes.jsonl").read_text().splitlines()
+            lines = self._text("meta/episodes.jsonl").splitlines()
             rows += [json.loads(line) for line in lines if line.strip()]
         else:
             for path in sorted(self.root.glob("meta/episodes/*/*.parquet")):
-                with self._pq.ParquetFile(path) as file:
+                name = path.relative_to(self.root).as_posix()
+                with self._pq.ParquetFile(existing_file(self.root, name, _FOLDER)) as file:
                     all_names = file.schema_arrow.names
                     names = [name for name in all_names if not name.startswith("stats/")]
                     rows += file.read(names).to_pylist()
@@ -259,7 +263,8 @@ class RecordedDataset:
 
     def columns(self, episode: RecordedEpisode, names: Sequence[str]) -> dict[str, list[Any]]:
         """Return columns of the rows of an episode; raises `ConfigError` if rows are missing."""
-        file = self.root / self.info["data_path"].format(**self._file_indices(episode, "data"))
+        file = self._file(episode, "data_path", "data")
+        self._require_rows(file)
         filters = [("episode_index", "=", episode.index)]
         table = self._pq.read_table(file, columns=list(names), filters=filters)
         columns: dict[str, list[Any]] = table.to_pydict()
@@ -269,6 +274,39 @@ class RecordedDataset:
                 "number; is the file complete?"
             )
         return columns
+
+    def _text(self, path: str) -> str:
+        return read_text(existing_file(self.root, path, _FOLDER))
+
+    def _file(self, episode: RecordedEpisode, key: str, content: str, **names: str) -> Path:
+        """Return the file with some content of an episode.
+
+        Args:
+            episode: The episode.
+            key: The key of the path's template in `meta/info.json`.
+            content: "data" for the rows of the episode, or "videos/FEATURE".
+            names: Further fields of the template.
+        """
+        values: dict[str, str | int] = {**self._file_indices(episode, content), **names}
+        path = fill_template(self.info[key], values, f"{self.root / _INFO_FILE}: {key}")
+        return existing_file(self.root, path, _FOLDER)
+
+    @cached_property
+    def _frames(self) -> int:
+        """The number of frames of all episodes."""
+        return sum(episode.length for episode in self._episodes())
+
+    def _require_rows(self, file: Path) -> None:
+        """Raise `ConfigError` if a table has more rows than all episodes together: equal rows take
+        no space in the file, but in memory.
+        """
+        with self._pq.ParquetFile(file) as table:
+            rows = table.metadata.num_rows
+        if rows > self._frames:
+            raise ConfigError(
+                f"{file}: expected at most the {self._frames} frames of the dataset, got {rows} "
+                "rows; is it the file of another dataset?"
+            )
 
     def _file_indices(self, episode: RecordedEpisode, content: str) -> dict[str, int]:
         """Return the numbers in the path of a file.
@@ -287,11 +325,10 @@ class RecordedDataset:
 
     def _video(self, episode: RecordedEpisode, feature: str) -> Iterator[np.ndarray]:
         """Yield the images of an episode, (H, W, 3) uint8 RGB."""
-        indices = self._file_indices(episode, f"videos/{feature}")
-        file = self.root / self.info["video_path"].format(video_key=feature, **indices)
+        file = self._file(episode, "video_path", f"videos/{feature}", video_key=feature)
         start_s = float(episode.metadata.get(f"videos/{feature}/from_timestamp") or 0)
         convert = rgb_converter()
-        with self._av.open(str(file)) as container:
+        with read_mp4(file, DEFAULT_LIMITS.pixels) as container:
             [stream, *_] = container.streams.video
             if start_s:
                 container.seek(int(start_s / stream.time_base), stream=stream)
@@ -375,11 +412,13 @@ class RecordedDataset:
         return features
 
 
-def _read_info(file: Path) -> dict[str, Any]:
-    """Read the description of a dataset; raises `ConfigError` if it is not a JSON object."""
+def _read_info(file: Path, text: str) -> dict[str, Any]:
+    """Return the description of a dataset in the text of a file; raises `ConfigError` if it is not
+    a JSON object.
+    """
     try:
-        info = json.loads(file.read_text())
-    except ValueError as error:
+        info = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise ConfigError(
             f"{file}: expected JSON, got an error, {error}; is the file complete?"
         ) from error

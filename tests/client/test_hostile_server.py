@@ -15,8 +15,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from websockets.exceptions import InvalidHandshake
 
 from vlagents_ray import Act, Obs, RemoteAgent, VLAgentsError
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.websocket import ProxiedSocket
 from vlagents_ray.errors import BY_CODE
 from vlagents_ray.protocol.frame_layout import pack, unpack
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_replies
@@ -183,6 +186,40 @@ def received(connection: socket.socket) -> bytes:
 def response(body: bytes, media_type: str, status: str = "200 OK") -> bytes:
     head = f"HTTP/1.1 {status}\r\ncontent-type: {media_type}\r\ncontent-length: {len(body)}\r\n\r\n"
     return head.encode() + body
+
+
+@pytest.mark.parametrize(
+    "status", ["301 Moved", "302 Found", "303 See", "307 Temporary", "308 Permanent"]
+)
+def test_a_websocket_follows_no_redirect(status: str) -> None:
+    """A server behind TLS could send its robot to an address without TLS."""
+    reached = threading.Event()
+    with tcp_server(lambda _: reached.set()) as other:
+
+        def answer(connection: socket.socket) -> None:
+            read_request(connection)
+            target = f"ws://127.0.0.1:{other}/"
+            connection.sendall(
+                f"HTTP/1.1 {status}\r\nlocation: {target}\r\ncontent-length: 0\r\n\r\n".encode()
+            )
+
+        with (
+            tcp_server(answer) as port,
+            pytest.raises(InvalidHandshake, match="redirects to 'ws://127"),
+        ):
+            ProxiedSocket(f"ws://127.0.0.1:{port}/v1/stream", Credentials(), 5)
+    assert not reached.is_set()
+
+
+def test_metadata_of_megabytes_are_not_parsed() -> None:
+    """Parsing takes longer than the time limit of the call."""
+    large = json.dumps({**METADATA, "weights": {"digest": "x" * 5 * 2**20}}).encode()
+    with (
+        http_policy(large, GOOD_REPLY) as url,
+        pytest.raises(VLAgentsError),
+        RemoteAgent(url, timeout_s=2, transport="http") as agent,
+    ):
+        agent.reset(Obs(), "x")
 
 
 @contextlib.contextmanager

@@ -16,10 +16,11 @@ import time
 from collections.abc import Iterator
 from typing import Any, cast
 
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import ClientConnection
 
 from vlagents_ray.client.shared_tls_socket import SharedTlsSocket
+from vlagents_ray.errors import shown
 
 _PERIOD_S = 0.1  # period at which the limits are checked
 
@@ -28,12 +29,32 @@ class SharedConnection(ClientConnection):
     """A connection with a TLS socket that several threads can use at the same time, for the
     argument `create_connection` of `connect`. With a plain TLS socket, the opening handshake may be
     lost, and exceed its time limit.
+
+    A redirect is an error, which `connect` would follow: a server behind TLS could send a robot to
+    any other address, also to one without TLS.
     """
 
     def __init__(self, sock: socket.socket, *args: Any, **options: Any) -> None:
         """Begin to read a connected socket; takes the arguments of `ClientConnection`."""
         shared = SharedTlsSocket(sock) if isinstance(sock, ssl.SSLSocket) else sock
         super().__init__(cast("socket.socket", shared), *args, **options)
+
+    def handshake(self, *args: Any, **options: Any) -> None:
+        """Perform the opening handshake; takes the arguments of `ClientConnection`.
+
+        Raises:
+            InvalidHandshake: The server does not accept the connection, or redirects it.
+        """
+        try:
+            super().handshake(*args, **options)
+        except InvalidStatus as error:
+            target = error.response.headers.get("location")
+            if target is None:
+                raise
+            raise InvalidHandshake(
+                f"the server redirects to {shown(target)}, which no client follows; connect to "
+                "that address if you trust it"
+            ) from error
 
 
 class LimitedWebSocket:

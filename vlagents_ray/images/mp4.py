@@ -6,15 +6,46 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.registry import require
+
+
+@contextlib.contextmanager
+def read_mp4(file: Path, most_pixels: int) -> Iterator[Any]:
+    """Open an MP4 file, which anybody may have written, and yield its container.
+
+    FFmpeg would otherwise open whatever the content looks like, among others lists of other files
+    and of addresses.
+
+    Args:
+        file: The file.
+        most_pixels: The largest number of pixels of a frame.
+
+    Raises:
+        ConfigError: The file is no MP4, has no video, or larger frames.
+    """
+    av: Any = require("av")
+    try:
+        container = av.open(str(file), format="mp4", options={"protocol_whitelist": "file"})
+    except (av.error.FFmpegError, OSError) as error:
+        raise ConfigError(f"{file}: expected an MP4 file, got an error ({error})") from error
+    with container:
+        if not container.streams.video:
+            raise ConfigError(f"{file}: expected a video, got none; is the file complete?")
+        stream = container.streams.video[0]
+        if stream.width * stream.height > most_pixels:
+            raise ConfigError(
+                f"{file}: expected at most {most_pixels} pixels in a frame, got "
+                f"{stream.width}x{stream.height}"
+            )
+        yield container
 
 
 def rgb_converter() -> Callable[[Any], np.ndarray]:

@@ -353,7 +353,7 @@ def test_a_database_of_views_or_of_odd_values_is_refused(
         ),
         (
             "UPDATE episodes SET trajectory = '../x.npz'",
-            "expected files of episodes in the folder of results",
+            "expected a file in the folder of results",
         ),
     ):
         shutil.copy(tmp_path / "run/results.db", tmp_path / "other.db")

@@ -331,9 +331,7 @@ def named(folder: Path, column: str, path: str) -> Path:
     ],
 )
 def test_a_path_out_of_a_folder_of_results_is_refused(path: str) -> None:
-    with pytest.raises(
-        ConfigError, match="expected files of episodes in the folder of results, got the path"
-    ):
+    with pytest.raises(ConfigError, match="expected a file in the folder of results, got the path"):
         require_below(path)
 
 
@@ -345,9 +343,7 @@ def test_paths_out_of_a_folder_of_results_are_refused_by_all_that_read_it(
     (tmp_path / "secret" / "key.mp4").write_text("secret")
     theirs = named(part("theirs"), column, "videos/../../secret/key.mp4")
     for read in (Results.load, lambda folder: merge(tmp_path / "out", [folder])):
-        with pytest.raises(
-            ConfigError, match="expected files of episodes in the folder of results"
-        ):
+        with pytest.raises(ConfigError, match="expected a file in the folder of results"):
             read(theirs)
     assert not list((tmp_path / "out").rglob("*.mp4"))
 

@@ -47,9 +47,9 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.recorder import DEFAULT_FPS, Trajectory, videos_of
 from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there
 from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results
-from vlagents_ray.images.mp4 import rgb_converter
+from vlagents_ray.images.mp4 import read_mp4, rgb_converter
 from vlagents_ray.naming import did_you_mean, distinct
-from vlagents_ray.registry import require
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS
 
 GRIPPER_FEATURE = "observation.gripper"
 VERSION = "policy_version"
@@ -370,7 +370,7 @@ def _finished(
         key = keys[camera]
         statistics = ImageStatistics()
         convert = rgb_converter()
-        with require("av").open(str(video)) as container:
+        with read_mp4(video, DEFAULT_LIMITS.pixels) as container:
             stream = container.streams.video[0]
             for frame in islice(container.decode(stream), len(demonstration.actions)):
                 statistics.add(convert(frame))

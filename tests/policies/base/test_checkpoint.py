@@ -26,7 +26,13 @@ from vlagents_ray.policies.base.checkpoint import (
     require_loaded,
     used_checkpoints,
 )
-from vlagents_ray.policies.base.checkpoint_files import digest, revision, weights_of
+from vlagents_ray.policies.base.checkpoint_files import (
+    digest,
+    files_in,
+    revision,
+    unfinished,
+    weights_of,
+)
 
 
 def test_a_step_takes_its_place_in_the_path(tmp_path: Path) -> None:
@@ -237,6 +243,27 @@ def test_a_link_to_a_folder_above_is_no_endless_way(folder: Path) -> None:
     before = digest([folder])
     (folder / "sub" / "round").symlink_to(folder)
     assert digest([folder]) == before
+
+
+def test_links_that_double_at_each_folder_are_followed_once(tmp_path: Path) -> None:
+    """There are 2**24 ways to the only file."""
+    for number in range(24):
+        (tmp_path / f"d{number}").mkdir()
+        for name in ("a", "b"):
+            (tmp_path / f"d{number}" / name).symlink_to(tmp_path / f"d{number + 1}")
+    (tmp_path / "d24").mkdir()
+    (tmp_path / "d24" / "weights.bin").write_text("w")
+    assert len(files_in(tmp_path / "d0")) == 1
+
+
+@pytest.mark.parametrize("read", [unfinished, lambda file: digest([file])])
+def test_a_header_that_is_nested_deeply_is_no_error_of_the_reader(
+    tmp_path: Path, read: Callable[[Path], str | None]
+) -> None:
+    header = b"[" * 10**5 + b"]" * 10**5
+    file = tmp_path / "model.safetensors"
+    file.write_bytes(len(header).to_bytes(8, "little") + header)
+    assert isinstance(read(file), str)
 
 
 def test_the_commit_is_that_of_the_policy_and_not_of_an_encoder_beside_it(

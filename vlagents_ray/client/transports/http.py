@@ -75,6 +75,7 @@ from vlagents_ray.protocol.messages import (
     read_address,
 )
 
+_MOST_JSON = 4 * 2**20  # size of a document, bytes; metadata with statistics have 0.1 MB
 _UNKNOWN_APP_S = 10.0  # a starting server has no route until its first replica exists
 # Maximum number of header values to try until the proxy's hash selects the chosen replica; it is
 # small, as each value costs a request. The second number is the time limit of each request, s,
@@ -636,6 +637,8 @@ def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
 
 
 def _json(body: bytes) -> Any:
+    if len(body) > _MOST_JSON:  # parsing would take longer than the time limit of the call
+        return None
     try:
         return json.loads(body)
     except (ValueError, RecursionError):  # the body is not JSON, or is hostile JSON

@@ -9,49 +9,32 @@ from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from glob import escape
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
-from vlagents_ray import disk
+from vlagents_ray import disk, foreign_files
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.ray_tools.git_state import GitState, code_in, code_of
 from vlagents_ray.registry import target_of
 
 VIDEOS, TRAJECTORIES, PROVENANCE = "videos", "trajectories", "provenance"
+_FOLDER = "the folder of results"
 _RESUME = "finished episodes are kept: continue with --resume"
 
 
 def require_below(path: str) -> str:
-    """Check the `path` of an episode's file in a results.db, which may come from another machine,
-    and return it.
-
-    Raises:
-        ConfigError: The path leads out of the folder of results.
+    """Return the `path` of an episode's file in a results.db, which may come from another machine;
+    raise `ConfigError` if it leads out of the folder of results.
     """
-    components = PurePosixPath(path).parts
-    if not components or path.startswith("/") or ".." in components or "\0" in path:
-        raise ConfigError(
-            f"expected files of episodes in the folder of results, got the path {path!r}, which "
-            "no evaluation writes; do not trust the author of this results.db"
-        )
-    return path
+    return foreign_files.require_below(path, _FOLDER)
 
 
 def inside(home: Path, path: str) -> Path:
     """Return the absolute path of the file `path` in the folder of results `home`; the file need
-    not exist.
-
-    Raises:
-        ConfigError: The path leads out of the folder, directly or through a symbolic link.
+    not exist. Raise `ConfigError` if the path leads out of the folder.
     """
-    resolved_path = (home / require_below(path)).resolve()
-    if not resolved_path.is_relative_to(home.resolve()):
-        raise ConfigError(
-            f"{home / path}: expected a file in the folder of results, got a symbolic link that "
-            "leads out of it; if you trust it, replace it with a copy of its target"
-        )
-    return resolved_path
+    return foreign_files.inside(home, path, _FOLDER)
 
 
 def trajectory_videos(home: Path, trajectory: str) -> list[str]:

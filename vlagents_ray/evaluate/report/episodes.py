@@ -19,7 +19,8 @@ from vlagents_ray.evaluate.artifacts.storage import outcome
 from vlagents_ray.evaluate.results.reader import Attempt, CaseResults, Episode, Results
 from vlagents_ray.evaluate.results.summary import errors_of_policies
 from vlagents_ray.images.jpeg_png import data_url, encode_jpeg
-from vlagents_ray.registry import require
+from vlagents_ray.images.mp4 import read_mp4
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS
 
 BUDGET = 24 * 2**20  # maximum total size of the videos that a page embeds, bytes
 POSTER = 224  # maximum side length of a poster, pixels
@@ -236,11 +237,10 @@ def errors(results: Results) -> Errors | None:
 
 def last_frame(video: Path) -> np.ndarray | None:
     """Return the last frame, (H, W, 3) uint8 RGB; None if the file cannot be decoded."""
-    av = require("av")
     try:
-        with av.open(str(video)) as container:
+        with read_mp4(video, DEFAULT_LIMITS.pixels) as container:
             frames = collections.deque(container.decode(video=0), maxlen=1)
-    except (OSError, ValueError):  # base classes of PyAV's errors for broken files
+    except (OSError, ValueError):  # includes ConfigError, and PyAV's errors for broken files
         return None
     return np.asarray(frames[0].to_ndarray(format="rgb24")) if frames else None
 

@@ -87,7 +87,7 @@ def _trouble(file: Path) -> str | None:
     check = next((check for suffix, check in _CHECKS.items() if file.name.endswith(suffix)), None)
     try:
         return None if check is None else check(file)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         # The file is truncated, or not in the format of its name.
         return f"cannot be read ({error})"
 
@@ -225,28 +225,30 @@ def files_in(path: Path) -> list[Path]:
     """Return the files of a checkpoint that its digest covers, sorted by name."""
     if path.is_file():
         return [path]
-    return sorted(_below(path, frozenset()))
+    return sorted(_below(path, set()))
 
 
-def _below(folder: Path, above: frozenset[str]) -> Iterator[Path]:
+def _below(folder: Path, seen: set[str]) -> Iterator[Path]:
     """Yield the files of a folder that a digest covers.
 
     Links are followed, as loaders do.
 
     Args:
         folder: The folder.
-        above: The real paths of the folder's parents, which are not entered again.
+        seen: The real paths of the folders that have been entered, which are not entered again:
+            each of them could be linked any number of times. This folder is added.
     """
-    within = above | {os.path.realpath(folder)}
+    seen.add(os.path.realpath(folder))
     with contextlib.suppress(OSError):  # The folder cannot be read or no longer exists.
-        for entry in list(folder.iterdir()):
+        # Sorted, so that the first of several links to a folder is always the same one.
+        for entry in sorted(folder.iterdir()):
             if entry.name.startswith((".", "__pycache__")):
                 continue
             if entry.is_file():
                 if entry.suffix not in _BESIDE:
                     yield entry
-            elif entry.is_dir() and os.path.realpath(entry) not in within:
-                yield from _below(entry, within)
+            elif entry.is_dir() and os.path.realpath(entry) not in seen:
+                yield from _below(entry, seen)
 
 
 def _sampled_blocks(file: Path, opened: BinaryIO, size: int) -> Iterator[bytes]:
@@ -289,6 +291,6 @@ def _header(opened: BinaryIO) -> tuple[bytes, list[tuple[int, int]]] | None:
         for begin, end in _data_offsets(text):
             middle = max(begin, (begin + end - _BLOCK) // 2)
             blocks.append((8 + length + middle, min(_BLOCK, end - begin)))
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     return text, blocks
