@@ -2,7 +2,7 @@
 
     VLAgentsError
     ├── InvalidInput (also ValueError)      the request is wrong; sending it again will not help
-    │   ├── MalformedMessage, MessageTooLarge
+    │   ├── MalformedMessage (UnsupportedImage), MessageTooLarge
     │   ├── InvalidObservation              MissingCamera, MissingState, NotOffered
     │   ├── UnknownSession, UnknownApp, NotReset, ContractMismatch
     │   ├── InvalidWeights, UnchangedWeights, NotTrainable, WeightsNotStaged
@@ -118,6 +118,15 @@ class MalformedMessage(InvalidInput):
     """
 
     code = "malformed"
+
+
+class UnsupportedImage(MalformedMessage):
+    """An image file has a form that costs too much to decode: a JPEG that is not baseline, or a
+    PNG that is interlaced or does not have 8 bits.
+    """
+
+    code = "unsupported_image"
+    status = 415
 
 
 class MessageTooLarge(InvalidInput):

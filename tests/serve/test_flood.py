@@ -33,6 +33,9 @@ from vlagents_ray_dialects.messages import lerobot
 pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
 
 SECONDS = 1.5  # 100 acts
+CAMERA_SECONDS = (
+    3.0  # of each turn of a robot with a large camera: three messages of a key of rate 1
+)
 # Of each row of the table. p99 needs a quiet machine and 10 s or more; the rows are printed by
 # `pytest -s`.
 ROW_SECONDS = float(os.environ.get("VLAGENTS_FLOOD_SECONDS", "1.5"))
@@ -162,6 +165,49 @@ def test_a_robots_act_takes_less_than_twice_as_long(
         if p50[1] < 2 * p50[0] and p90[1] < 2 * max(p90[0], NOISE_MS):
             return
     raise AssertionError(f"alone and beside the flood, ms: p50 and p90 of {found}")
+
+
+@pytest.mark.parametrize("part", ["images", *flood.PARTS])
+def test_the_pauses_of_a_robot_with_a_large_camera_are_short(
+    where: flood.Where,
+    attackers: Popen[str],
+    part: str,
+    record_property: Callable[[str, object], None],
+) -> None:
+    """Medians hide a robot that stops once a second: the number of acts and the longest pause do
+    not. The robot is measured alone and beside the flood in turns.
+    """
+    with contextlib.closing(flood.CameraRobot(where)) as robot:
+        rows = []
+        for _ in range(ATTEMPTS):
+            alone: list[float] = []
+            beside: list[float] = []
+            for _ in range(TURNS):
+                await_calm(where["pid"])
+                alone += robot.acts_ms(CAMERA_SECONDS)
+                with flood.attacking(attackers, "own port", part, where, 8):
+                    beside += robot.acts_ms(CAMERA_SECONDS)
+            rows.append(pauses_row(sorted(alone), sorted(beside)))
+            print(f"PAUSES own port | {part} | {rows[-1]}")
+            ticks = (max(beside) - max(alone)) / (1e3 * robot.TICK_S)
+            if ticks < 2 and len(beside) > 0.9 * len(alone):
+                break
+        else:
+            raise AssertionError("\n".join(rows))
+    record_property("row", rows[-1])
+
+
+def pauses_row(alone: list[float], beside: list[float]) -> str:
+    """Return a text with acts a second, percentiles and the longest pause, alone and beside a
+    flood.
+    """
+    seconds = TURNS * CAMERA_SECONDS
+    pairs = [("acts a second", len(alone) / seconds, len(beside) / seconds)]
+    for percent in (50, 90, 99):
+        values = flood.percentile(alone, percent), flood.percentile(beside, percent)
+        pairs.append((f"p{percent} ms", *values))
+    pairs.append(("longest ms", alone[-1], beside[-1]))
+    return ", ".join(f"{name} {before:.1f} -> {after:.1f}" for name, before, after in pairs)
 
 
 def resources(server: int) -> tuple[float, int]:

@@ -330,7 +330,7 @@ def test_each_image_is_decoded_once_however_often_it_is_named(decoded: list[str]
         "info": {"again": {"$": ["img", 0]}},
     }
     answers = read_requests(
-        frame(*[{"op": "reset", "obs": both, "history": [both] * 5}] * 3, files=[JPEG, PNG]),
+        frame(*[{"op": "reset", "obs": both, "history": [both] * 5}] * 3, files=[JPEG, JPEG]),
         message_admission(),
     )
     assert all(isinstance(answer, Request) for answer in answers)

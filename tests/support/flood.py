@@ -52,17 +52,19 @@ from benchmarks.processes import cpu_seconds
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.shm import ShmTransport
+from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import MalformedMessage, PolicyUnavailable
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
-from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, MessageLimits, Op, PlasmaAddress, Request
 from vlagents_ray.protocol.websocket_frames import frame_head
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import Keys, NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
+from vlagents_ray.serve.endpoints import http_connection
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -109,10 +111,8 @@ def key_of(endpoint: str) -> str:
 
 def serve() -> None:
     """Say where it is, as JSON, and serve until the standard input ends."""
-    rated = [
-        _key(key_of(endpoint), rate=1, priority="simulation")
-        for endpoint in (*MESSAGE_FLOODS, *HTTP)
-    ]
+    # Without a priority, which is the default of `keys create`: their messages have robots' rights.
+    rated = [_key(key_of(endpoint), rate=1) for endpoint in (*MESSAGE_FLOODS, *HTTP)]
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
     check_key, limits = partial(keys.check, app="app"), MessageLimits()
     engine = Engine(_Policy(), EngineSettings(session_idle_s=IDLE_S))
@@ -247,7 +247,7 @@ def _no_replica(*_: object) -> RemoteAgent:
 
 def serve_gateways() -> None:
     """Serve the dialects with their own port, without a replica; print their ports as JSON."""
-    rated = [_key(key_of(endpoint), rate=1, priority="simulation") for endpoint in GATEWAYS]
+    rated = [_key(key_of(endpoint), rate=1) for endpoint in GATEWAYS]
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
     limits = MessageLimits()
     gr00t._MESSAGE_S = vlagents._FRAME_S = lerobot_dialect._UPLOAD_S = SLOW_S
@@ -333,12 +333,11 @@ def _raw_frame() -> bytes:
     return b"".join(frame_layout.pack({"op": "reset", "obs": node}, [bytes(size)]))
 
 
-def _hostile(name: str) -> bytes:
-    """A small image whose decoding would take seconds, or as long as its structure may."""
-    seen = {"cameras": {"front": {"$": ["img", 0]}}}
-    return b"".join(
-        frame_layout.pack({"op": "reset", "obs": seen}, [hostile_images.FILES[name](200_000)])
-    )
+def _hostile(recipe: hostile_images.PngRecipe | hostile_images.JpegRecipe, number: int) -> bytes:
+    """A message of `number` files that take as long as their structure may."""
+    seen = [{"cameras": {"front": {"$": ["img", index]}}} for index in range(number)]
+    header = {"op": "reset", "obs": seen[0], "history": seen[1:]}
+    return b"".join(frame_layout.pack(header, [recipe.file()] * number))
 
 
 def _probe() -> bytes:
@@ -514,10 +513,12 @@ PARTS: dict[str, Callable[[], bytes]] = {
     "names": _names,
     "blobs": _blobs,
     "history": _history,
-    "scans": partial(_hostile, "JPEG: scans"),
-    "allowed scans": partial(_hostile, "JPEG: scans within the limit"),
-    "chunks": partial(_hostile, "PNG: empty chunks"),
-    "rows of no columns": partial(_hostile, "PNG: no columns"),
+    # As many as are decoded by the thread that reads them, and as many as a request may have.
+    "some worst JPEG": partial(_hostile, hostile_images.WORST["JPEG"], 60),
+    "many worst JPEG": partial(_hostile, hostile_images.WORST["JPEG"], 256),
+    "some worst PNG": partial(_hostile, hostile_images.WORST["PNG"], 21),
+    "many worst PNG": partial(_hostile, hostile_images.WORST["PNG"], 256),
+    "progressive JPEG": partial(_hostile, hostile_images.JpegRecipe(process=0xC2, scans=98), 256),
 }
 """The largest message in each part of the grammar of a frame; "images" is the largest that each
 endpoint takes.
@@ -539,16 +540,42 @@ def _bomb() -> bytes:
 
 
 HANDSHAKE = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
+# The limits of a head: its size, and its fields, of which a handshake here has five more.
+_HEAD, _FIELDS = http_connection.HEAD_BYTES, http_connection.MOST_FIELDS - 5
+
+
+def _head(name: str, first: bytes, *fields: bytes) -> bytes:
+    """A head of the largest size, in which "%" stands for what fills it up."""
+    head = first + b"".join(fields) + b"\r\n"
+    gaps = head.count(b"%")
+    return head.replace(b"%", name.encode() * max(0, (_HEAD - len(head)) // max(1, gaps)))
+
+
+# The most expensive heads within these limits, before a key is known.
+HEADS: dict[str, bytes] = {
+    "short fields": _head("", b"POST / HTTP/1.1\r\n", *[b"a: b\r\n"] * _FIELDS),
+    "long names": _head("A", b"POST / HTTP/1.1\r\n", *[b"%: b\r\n"] * _FIELDS),
+    "long values": _head("b", b"POST / HTTP/1.1\r\n", *[b"a: %\r\n"] * _FIELDS),
+    "a long name": _head("A", b"POST / HTTP/1.1\r\n", b"%: b\r\n"),
+    "a long URL": _head("a", b"POST /% HTTP/1.1\r\nhost: x\r\n"),
+    "a long URL with a host": _head("a", b"POST http://%/ HTTP/1.1\r\nhost: x\r\n"),
+    "almost upgrades": _head(" ", b"GET / HTTP/1.1\r\n", *[b"upgrade:%x\r\n"] * _FIELDS),
+    "a long handshake": _head(
+        "A", HANDSHAKE + b"Connection: Upgrade\r\n", *[b"%: b\r\n"] * _FIELDS
+    ),
+    "more fields": _head("", b"POST / HTTP/1.1\r\n", *[b"a: b\r\n"] * 2700),
+}
 PART_OF_A_MESSAGE = frame_head(15 * 2**20, bytes(4)) + bytes(2 * 2**20)
 # What a client sends before it shows a key, and whether it then waits.
 BEFORE_A_KEY: dict[str, tuple[bytes, bool]] = {
     "nothing": (b"", True),
     "half a handshake": (HANDSHAKE, True),
     "a refused handshake": (
-        HANDSHAKE + b"Connection: Upgrade\r\n" + b"a: b\r\n" * 2000 + b"\r\n",
+        HANDSHAKE + b"Connection: Upgrade\r\n" + b"a: b\r\n" * 90 + b"\r\n",
         False,
     ),
     "closed at once": (b"", False),
+    **{f"a head: {name}": (head, False) for name, head in HEADS.items()},
 }
 # What it sends with a key: once, and then it waits; or repeatedly.
 ONCE: dict[str, bytes] = {"half a head": b"\x82", "half a message": PART_OF_A_MESSAGE}
@@ -663,6 +690,10 @@ HTTP_BEHAVIOURS = {
     "a head that is too long": HttpBehaviour(
         lambda endpoint, key: _request(endpoint, key, *[_HEADER_FIELD] * 100)
     ),
+    **{
+        f"a head: {name}": HttpBehaviour(lambda _endpoint, _key, head=head: head, waits=False)
+        for name, head in HEADS.items()
+    },
     "requests without a key": HttpBehaviour(
         lambda _endpoint, _key: b"",
         lambda endpoint, _key: _with_content(endpoint, "wrong", b"x") * 100,
@@ -1264,6 +1295,42 @@ def robot(where: Where) -> Iterator[ShmTransport]:
     assert reply.error is None
     yield transport
     transport.close()
+
+
+class CameraRobot:
+    """A robot with a camera of 1920x1080, which sends JPEG over a WebSocket at 30 Hz."""
+
+    TICK_S = 1 / 30
+
+    def __init__(self, where: Where) -> None:
+        """Connect to the replica's own port, and begin a session."""
+        pixels = np.random.default_rng(0).integers(0, 255, (135, 240, 3), np.uint8)
+        self._file = jpeg_png.encode_jpeg(np.repeat(np.repeat(pixels, 8, 0), 8, 1), 85, "420")
+        port, path = where["own"]
+        headers = {"authorization": "Bearer robot"}
+        self._stream = Stream(urlsplit("http://127.0.0.1"), port, path, 30, headers)
+        self._call("reset")
+
+    def _call(self, op: Op) -> None:
+        seen = {"cameras": {"front": {"$": ["img", 0]}}}
+        self._stream.send(b"".join(frame_layout.pack({"op": op, "obs": seen}, [self._file])), 60)
+        [reply] = decode_replies(self._stream.recv(60))
+        assert reply.error is None, reply.error
+
+    def acts_ms(self, seconds: float) -> list[float]:
+        """Return the durations of the robot's acts, ms, sorted."""
+        taken, end = [], time.monotonic() + seconds
+        while time.monotonic() < end:
+            begun = time.perf_counter()
+            self._call("act")
+            taken_s = time.perf_counter() - begun
+            taken.append(taken_s * 1e3)
+            time.sleep(max(0.0, self.TICK_S - taken_s))
+        return sorted(taken)
+
+    def close(self) -> None:
+        """End the session."""
+        self._stream.close()
 
 
 def acts_ms(robot: ShmTransport, seconds: float) -> list[float]:

@@ -16,6 +16,10 @@ class FrozenBucket(TokenBucket):
         """Take tokens without a refill, at the time at which the bucket was created."""
         return super().take(self._refilled, number)
 
+    def owe(self, now: float, number: float) -> None:
+        """Take tokens without a refill, even if there are fewer."""
+        super().owe(self._refilled, number)
+
     @property
     def taken(self) -> float:
         """Return the number of tokens taken so far."""

@@ -5,6 +5,7 @@ Several threads are used if that is faster.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +15,7 @@ import numpy as np
 
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.images import jpeg_png
-from vlagents_ray.images.image_file import read_structure
+from vlagents_ray.images.image_file import ImageFile, read_structure
 from vlagents_ray.images.thread_map import MOST_THREADS, thread_map
 
 if TYPE_CHECKING:
@@ -75,6 +76,40 @@ def encode_files(cameras: Sequence[np.ndarray], codec: ImageCodec) -> list[bytes
     return thread_map(codec.file, cameras, work_s)
 
 
+def _decode_missing(
+    files: Sequence[ImageFile],
+    images: list[Any],
+    missing: Sequence[int],
+    budget: Budget,
+    attributed: Callable[[Callable[[ImageFile], np.ndarray], ImageFile, int], np.ndarray],
+) -> None:
+    """Decode the files whose images are `missing`, and store these in `images`."""
+    spent_s: dict[int, float] = {}  # CPU time by the index of the file
+
+    def decode(index: int) -> np.ndarray:
+        begun = time.thread_time()
+        try:
+            return attributed(jpeg_png.decode_file, files[index], index)
+        finally:
+            spent_s[index] = time.thread_time() - begun
+
+    seconds = sum(files[index].decoding_s for index in missing)
+    threads = 1 if budget.serial else MOST_THREADS
+    scratch_bytes = sum(sorted(files[index].scratch_bytes for index in missing)[-threads:])
+    is_bounded = all(files[index].is_jpeg for index in missing)
+    with budget.decoding(seconds, scratch_bytes, is_bounded=is_bounded):
+        try:
+            decoded = (
+                [decode(index) for index in missing]
+                if budget.serial
+                else thread_map(decode, missing, seconds)
+            )
+        finally:
+            budget.spend(sum(spent_s.values()))
+    for index, image in zip(missing, decoded, strict=True):
+        images[index] = image
+
+
 def decode_files(
     files: Sequence[bytes | memoryview], budget: Budget, names: Sequence[str] = ()
 ) -> list[np.ndarray]:
@@ -101,23 +136,17 @@ def decode_files(
             message = str(error).removeprefix("image: ")
             raise type(error)(f"camera {names[index][:40]!r}: {message}") from error.__cause__
 
+    begun = time.thread_time()
     read = partial(read_structure, max_pixels=budget.limits.pixels)
     checked = [attributed(read, file, index) for index, file in enumerate(files)]
+    budget.spend(time.thread_time() - begun)
     budget.hold(sum(file.image_bytes for file in checked))
 
-    def decode(index: int) -> np.ndarray:
-        return attributed(jpeg_png.decode_file, checked[index], index)
-
-    seconds = sum(file.decoding_s for file in checked)
-    threads = 1 if budget.serial else MOST_THREADS
-    scratch_bytes = sum(sorted(file.scratch_bytes for file in checked)[-threads:])
-    with budget.decoding(seconds, scratch_bytes):
-        indices = range(len(checked))
-        images = (
-            [decode(index) for index in indices]
-            if budget.serial
-            else thread_map(decode, indices, seconds)
-        )
+    images: list[Any] = [budget.image_of(file.data) for file in checked]
+    missing = [index for index, image in enumerate(images) if image is None]
+    _decode_missing(checked, images, missing, budget, attributed)
+    for index in missing:
+        budget.keep_image(checked[index].data, images[index])
     if budget.files is not None:
         budget.files.update(
             (id(image), (image, file)) for image, file in zip(images, files, strict=True)

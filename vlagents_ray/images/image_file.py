@@ -1,20 +1,22 @@
 """The structure of a JPEG or PNG file, which is checked before any part of the file is decoded.
 
 The image size in the header of a file does not bound the cost of decoding: a progressive JPEG may
-have any number of scans, of 12 bytes each, and a PNG any number of chunks. The check therefore
-reads the structure, and estimates the cost from the work of the decoder: samples with their
-padding, scans, rows and bytes.
+have any number of scans, each of which visits all pixels, and a PNG any number of chunks. Only the
+forms that cameras and their encoders write are therefore accepted, whose cost follows from their
+pixels and bytes:
+
+- JPEG: baseline (Huffman coding, 8 bits) with one header and one scan.
+- PNG: 8 bits per channel without interlacing, with at most as much data as its rows need.
 """
 
 from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, UnsupportedImage
 
 JPEG_MAGIC = b"\xff\xd8\xff"
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -23,33 +25,46 @@ PNG_HEADER = struct.Struct(">2I5B")
 # Header fields after the size, for an RGB image of 8 bits without interlacing.
 RGB8 = (8, 2, 0, 0, 0)
 
-# Limits of the structure. Typical encoders write about ten scans, and chunks of at least 4 KiB.
-_MOST_SCANS = 100
-# The largest number of segments of a JPEG before its first scan, or of chunks of a PNG. One more is
-# allowed for each KiB of the file.
-_MOST_SEGMENTS = 256
-_MOST_METADATA = 64 * 1024  # bytes that a file may have in addition to twice the size of its pixels
+# The largest number of segments before the scan of a JPEG. Encoders write about ten, and the
+# programs that edit photographs some more.
+_MOST_SEGMENTS = 64
+# The largest number of chunks of a PNG, to which one is added for each 4 KiB of the file. Encoders
+# write their data in chunks of at least 8 KiB.
+_MOST_CHUNKS = 64
+_MOST_METADATA = 64 * 1024  # bytes that a file may have in addition to its pixels
 
-# Estimated times on one core. No known kind of file takes more than three times as long.
+# Estimated times on one core. The search in `tests/images/test_decoding_cost.py` finds no file that
+# takes three times as long.
 _FILE_S = 20e-6
+_PART_S = 1e-6  # per segment or chunk
 _SAMPLE_S = 1.7e-9  # per sample of a JPEG
-_SCAN_S = 0.1e-9  # per sample of a JPEG and scan after the first
-_BASELINE_BYTE_S, _PROGRESSIVE_BYTE_S = 5e-9, 20e-9  # per byte of a JPEG
-# Times per byte of the unpacked rows, for files of `encode_png` and for files that Pillow decodes.
-_OWN_PNG_S, _PNG_S = 7e-9, 12e-9
-_PILLOW_S = 70e-6  # per PNG file that Pillow decodes
-_PILLOW_ROW_S = 0.1e-6  # per row that Pillow decodes
+_JPEG_BYTE_S = 5e-9  # per byte of a JPEG
+# Per PNG file: Pillow takes 70 us, and a slice of the smallest data up to 1 ms.
+_PNG_FILE_S = 500e-6
+_PNG_ROW_S = 0.1e-6  # per row
+_PNG_S = 12e-9  # per byte of the unpacked rows
+_PNG_BYTE_S = 5e-9  # per byte of the file
 # The memory that Pillow needs in addition to the result, bytes per pixel: the image in 32 bits, and
-# copies of it.
-_PILLOW_PIXEL_BYTES = 16
+# copies of the unpacked rows.
+_PILLOW_PIXEL_BYTES = 20
 
-_SOF = {0xC0: "baseline", 0xC1: "extended", 0xC2: "progressive"}
-# Markers of lossless, hierarchical or arithmetic coding.
-_OTHER_SOF = {*range(0xC3, 0xD0)} - {0xC4, 0xC8, 0xCC}
-_SOS, _EOI = 0xDA, 0xD9
+_BASELINE, _SOS, _EOI = 0xC0, 0xDA, 0xD9
+_SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of the headers of all processes
+_PROCESSES = {0xC1: "extended", 0xC2: "progressive", 0xC9: "arithmetic", 0xCA: "arithmetic"}
 _FILL = re.compile(b"\xff+")  # fill bytes, any number of which may precede a marker
+# The first marker after the data of a scan: neither a byte 0xFF of the data nor a restart.
+_END_OF_SCAN = re.compile(b"\xff[^\x00\xff\xd0-\xd7]")
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # PNG colour type -> number of channels
 _CRITICAL = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
+
+_ENCODE_BASELINE = (
+    "encode it with progressive=False (Pillow) or IMWRITE_JPEG_PROGRESSIVE 0 (OpenCV); simplejpeg "
+    "and the JPEG of cameras are baseline"
+)
+_ENCODE_8_BITS = (
+    'convert it to 8 bits first, with image.convert("RGB") (Pillow) or astype(np.uint8) (OpenCV), '
+    "and encode it without interlacing"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +75,9 @@ class ImageFile:
     height: int
     width: int
     decoding_s: float  # estimated time on one core, s
-    scratch_bytes: int  # memory that decoding needs in addition to the image, bytes
-    # The name, start and end of each critical chunk of a PNG.
+    scratch_bytes: int = 0  # memory that decoding needs in addition to the image, bytes
+    channels: int = 3  # channels of the rows of a PNG
+    # The name, start and end of each critical chunk of a PNG; empty for a JPEG.
     chunks: tuple[tuple[bytes, int, int], ...] = ()
 
     @property
@@ -73,14 +89,19 @@ class ImageFile:
         """The size of the decoded image, (H, W, 3) uint8, in bytes."""
         return 3 * self.height * self.width
 
+    @property
+    def row_bytes(self) -> int:
+        """The size of an unpacked row of a PNG with the byte of its filter, in bytes."""
+        return 1 + self.channels * self.width
+
 
 def read_structure(data: bytes | memoryview, max_pixels: int) -> ImageFile:
     """Check the structure of a JPEG or PNG file, and estimate the cost of decoding it.
 
     Raises:
-        MalformedMessage: The data are not a JPEG or PNG file, or are a variant that no camera
-            writes.
-        MessageTooLarge: The image declares more than `max_pixels`, or the file has too many scans,
+        MalformedMessage: The data are not a JPEG or PNG file.
+        UnsupportedImage: The file has a form whose cost does not follow from its pixels.
+        MessageTooLarge: The image declares more than `max_pixels`, or the file has too many
             segments or bytes.
     """
     file = bytes(data)
@@ -94,55 +115,58 @@ def read_structure(data: bytes | memoryview, max_pixels: int) -> ImageFile:
 
 
 def _read_jpeg(file: bytes, max_pixels: int) -> ImageFile:
-    frame = None
+    header = None
     at = 2
-    for _ in range(_MOST_SEGMENTS + len(file) // 1024):
+    segments = 0
+    while segments < _MOST_SEGMENTS:
+        segments += 1
         marker, start, end = _jpeg_segment(file, at)
-        if marker in _OTHER_SOF:
-            raise MalformedMessage(
-                "image: expected a JPEG with baseline or progressive Huffman coding, got the "
-                f"process SOF{marker - 0xC0}; encode it again"
-            )
         if marker in _SOF:
-            if frame is not None:
-                raise MalformedMessage("image: broken JPEG (it has two headers)")
-            frame = marker, file[start:end]
+            if marker != _BASELINE:
+                process = _PROCESSES.get(marker, f"SOF{marker - _BASELINE}")
+                raise UnsupportedImage(
+                    f"image: expected a baseline JPEG, got {process} coding; {_ENCODE_BASELINE}"
+                )
+            if header is not None:
+                raise UnsupportedImage("image: expected a JPEG with one header, got two")
+            header = file[start:end]
         if marker == _SOS:
             break
         at = end
     else:
         raise MessageTooLarge(
-            "image: a JPEG with too many segments before its first scan; encode it again"
+            f"image: expected a JPEG of at most {_MOST_SEGMENTS} segments, got more; encode it "
+            "again without metadata"
         )
-    if frame is None:
+    if header is None:
         raise MalformedMessage("image: broken JPEG (its first scan precedes its header)")
 
-    kind, header = frame
     height, width, components, unit_height, unit_width = _jpeg_frame(header)
-    _check_size(len(file), height, width, 3, max_pixels)
-    scans = _count_scans(file)
-    if scans > _MOST_SCANS:
-        raise MessageTooLarge(
-            f"image: expected a JPEG of at most {_MOST_SCANS} scans, got {scans}; encode it again"
-        )
+    _check_size(len(file), height, width, 6 * height * width, max_pixels)
+    _check_only_scan(file, start, end, components)
 
     # The decoder pads an image to whole units of up to 32 x 32 pixels.
     padded_pixels = -(-height // unit_height) * unit_height * -(-width // unit_width) * unit_width
-    samples = components * padded_pixels
-    is_buffered = (
-        kind == 0xC2 or scans > 1 or (components > 1 and end - start != 4 + 2 * components)
-    )
-    byte_s = _PROGRESSIVE_BYTE_S if is_buffered else _BASELINE_BYTE_S
-    seconds = _FILE_S + samples * (_SAMPLE_S + (scans - 1) * _SCAN_S) + len(file) * byte_s
-    coefficients = 2 * samples if is_buffered else 0  # coefficients of 16 bits, for the whole image
-    return ImageFile(file, height, width, seconds, coefficients)
+    seconds = _FILE_S + segments * _PART_S
+    seconds += components * padded_pixels * _SAMPLE_S + len(file) * _JPEG_BYTE_S
+    return ImageFile(file, height, width, seconds)
 
 
-def _count_scans(file: bytes) -> int:
-    """Return the number of markers of a scan, including bytes of metadata that look like one."""
-    # `bytes.count` of two bytes takes 2 (15 kB) to 8 times (75 kB) as long.
-    codes = np.frombuffer(file, np.uint8)
-    return int(np.count_nonzero((codes[:-1] == 0xFF) & (codes[1:] == _SOS)))
+def _check_only_scan(file: bytes, start: int, end: int, components: int) -> None:
+    """Raise an error unless the scan whose header is at `start` has all components, and the image
+    ends after it.
+    """
+    scan_components = file[start] if end > start else 0
+    following = _END_OF_SCAN.search(file, end)
+    if following is None:
+        raise MalformedMessage("image: broken JPEG (it ends within its scan)")
+    marker = following.group()[1]
+    if scan_components != components or marker != _EOI:
+        got = f"a scan of {scan_components} of {components} components, then marker {marker:#x}"
+        raise UnsupportedImage(
+            f"image: expected a baseline JPEG with one scan of all components, got {got}; "
+            f"{_ENCODE_BASELINE}"
+        )
 
 
 def _jpeg_segment(file: bytes, at: int) -> tuple[int, int, int]:
@@ -171,8 +195,10 @@ def _jpeg_frame(header: bytes) -> tuple[int, int, int, int, int]:
         max(8 * (each >> 4) for each in sampling),
         max(8 * (each & 15) for each in sampling),
     )
-    if precision != 8 or components > 4 or not 0 < unit_width <= 32 or not 0 < unit_height <= 32:
-        raise MalformedMessage("image: expected a JPEG of 8 bits with a valid header, got another")
+    if precision != 8:
+        raise UnsupportedImage(f"image: expected a JPEG of 8 bits, got {precision} bits")
+    if components > 4 or not 0 < unit_width <= 32 or not 0 < unit_height <= 32:
+        raise MalformedMessage("image: broken JPEG (its header has invalid components)")
     return height, width, components, unit_height, unit_width
 
 
@@ -195,28 +221,39 @@ def _read_png(file: bytes, max_pixels: int) -> ImageFile:
             "image: broken PNG (its data are missing, incomplete or not in one piece)"
         )
 
-    width, height, depth, colour, *_ = PNG_HEADER.unpack_from(file, 16)
-    if colour not in _CHANNELS or depth > 16:
+    width, height, depth, colour, _, _, interlace = PNG_HEADER.unpack_from(file, 16)
+    if colour not in _CHANNELS:
         raise MalformedMessage(f"image: broken PNG (colour type {colour} of {depth} bits)")
-    bits = _CHANNELS[colour] * depth
-    rows_bytes = height * (1 + -(-width * bits // 8))
-    _check_size(len(file), height, width, max(3, bits // 8), max_pixels)
+    if depth != 8 or interlace:
+        kind = f"{depth} bits" + (" with interlacing" if interlace else "")
+        raise UnsupportedImage(
+            f"image: expected a PNG of 8 bits without interlacing, got {kind}; {_ENCODE_8_BITS}"
+        )
+    channels = _CHANNELS[colour]
+    rows_bytes = height * (1 + width * channels)
+    # The data of the most wasteful encoder, which codes each byte in 9 bits (`stb_image_write`).
+    packed_bytes = rows_bytes + rows_bytes // 8 + 1024
+    _check_size(len(file), height, width, packed_bytes, max_pixels)
+    data_bytes = sum(end - start - 12 for _, start, end in chunks[first:last])
+    if data_bytes > packed_bytes:
+        raise MessageTooLarge(
+            f"image: expected a PNG with at most {packed_bytes} bytes of data for {height}x{width} "
+            f"pixels, got {data_bytes}; encode it again"
+        )
 
+    seconds = _PNG_FILE_S + rows_bytes * _PNG_S + height * _PNG_ROW_S + len(file) * _PNG_BYTE_S
     if is_own_png(file, chunks):
-        seconds, scratch = _FILE_S + rows_bytes * _OWN_PNG_S, 2 * rows_bytes
+        scratch = 2 * rows_bytes
     else:
-        seconds = _PILLOW_S + rows_bytes * _PNG_S + height * _PILLOW_ROW_S
         scratch = _PILLOW_PIXEL_BYTES * height * (width + 1)
-    return ImageFile(
-        file, height, width, seconds + len(file) * _BASELINE_BYTE_S, scratch, tuple(chunks)
-    )
+    return ImageFile(file, height, width, seconds, scratch, channels, tuple(chunks))
 
 
 def _png_chunks(file: bytes) -> list[tuple[bytes, int, int]]:
     """Return the name, the start and the end of each critical chunk, until the final chunk."""
     critical = []
     at = len(PNG_MAGIC)
-    for _ in range(_MOST_SEGMENTS + len(file) // 1024):
+    for _ in range(_MOST_CHUNKS + len(file) // 4096):
         name = file[at + 4 : at + 8]
         end = at + 12 + int.from_bytes(file[at : at + 4], "big")
         if len(name) < 4 or end > len(file):
@@ -229,9 +266,7 @@ def _png_chunks(file: bytes) -> list[tuple[bytes, int, int]]:
     raise MessageTooLarge("image: a PNG with too many chunks; encode it again")
 
 
-def is_own_png(
-    file: bytes, chunks: list[tuple[bytes, int, int]] | tuple[tuple[bytes, int, int], ...]
-) -> bool:
+def is_own_png(file: bytes, chunks: Sequence[tuple[bytes, int, int]]) -> bool:
     """Return whether a PNG has exactly the chunks that `encode_png` writes."""
     header_end, data_start = chunks[0][2], chunks[1][1]
     is_whole = len(chunks) == 3 and header_end == data_start and chunks[2][2] == len(file)
@@ -241,8 +276,11 @@ def is_own_png(
 
 
 def _check_size(
-    file_bytes: int, height: int, width: int, pixel_bytes: int, max_pixels: int
+    file_bytes: int, height: int, width: int, packed_bytes: int, max_pixels: int
 ) -> None:
+    """Raise an error if an image is empty or has too many pixels, or if its file has more than
+    `packed_bytes` and the bytes of metadata.
+    """
     if not height or not width:
         raise MalformedMessage(
             f"image: expected at least 1x1 pixels, got a header with {height}x{width}"
@@ -252,7 +290,7 @@ def _check_size(
             f"image: expected at most {max_pixels} pixels, got {height}x{width} declared; send a "
             "smaller one, or raise `limits.pixels`"
         )
-    max_bytes = 2 * pixel_bytes * height * width + _MOST_METADATA
+    max_bytes = packed_bytes + _MOST_METADATA
     if file_bytes > max_bytes:
         raise MessageTooLarge(
             f"image: expected a file of at most {max_bytes} bytes for {height}x{width} pixels, "

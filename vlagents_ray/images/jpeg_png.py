@@ -6,7 +6,7 @@ declares more pixels than the caller allows is rejected before memory is allocat
 PNG files are written with only numpy and zlib: all rows have the filter "Up" (the difference to the
 row above), and zlib uses its run-length strategy. Searching for better filters or longer matches
 takes several times as long, and saves only a few per cent on camera images with noise. Such files
-are also decoded with numpy and zlib alone; other PNG files need Pillow.
+are also decoded with numpy and zlib alone; the rows of other PNG files need Pillow.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ from __future__ import annotations
 import base64
 import io
 import struct
+import time
 import warnings
 import zlib
+from collections.abc import Iterator
 
 import numpy as np
 import simplejpeg
@@ -31,12 +33,19 @@ from vlagents_ray.images.image_file import (
     PNG_MAGIC,
     RGB8,
     ImageFile,
-    is_own_png,
     read_structure,
 )
 
 MAX_PIXELS = 4096 * 4096  # default limit for one image
 _UP = 2
+
+# A PNG is unpacked in at most this number of slices, of at least this size in bytes. Each slice
+# waits for Python's global lock.
+_SLICES, _SLICE_BYTES = 32, 4096
+# Maximum CPU time of unpacking a PNG, as a multiple of the estimated time of decoding it. Data of
+# encoders take at most a third of the estimate, so this leaves room for machines that are six times
+# slower. The last slice may take half of the estimate in addition.
+_INFLATE_FACTOR = 2.0
 
 
 def encode_jpeg(image: np.ndarray, quality: int = 85, subsampling: str = "444") -> bytes:
@@ -73,19 +82,20 @@ def decode(data: bytes | memoryview, max_pixels: int = MAX_PIXELS) -> np.ndarray
 
     Raises:
         MalformedMessage: The data are not a complete image.
+        UnsupportedImage: The file is neither a baseline JPEG nor a PNG of 8 bits without
+            interlacing.
         MessageTooLarge: The image declares more than `max_pixels`, or its file has too many parts
-            or bytes.
+            or bytes, or takes too long to unpack.
     """
     return decode_file(read_structure(data, max_pixels))
 
 
 def decode_file(file: ImageFile) -> np.ndarray:
     """Decode a file whose structure has been checked, as `decode` does; raises
-    `MalformedMessage`.
+    `MalformedMessage` and `MessageTooLarge`.
     """
     if not file.is_jpeg:
-        image = _decode_own_png(file) if is_own_png(file.data, file.chunks) else None
-        return _decode_png(file) if image is None else image
+        return _decode_png(file)
 
     # The default is the strict mode, which rejects truncated data. Otherwise, libjpeg would fill
     # the missing part with grey.
@@ -101,10 +111,67 @@ def decode_file(file: ImageFile) -> np.ndarray:
 
 
 def _decode_png(file: ImageFile) -> np.ndarray:
-    """Decode any PNG file with Pillow.
+    """Decode a PNG file: with numpy if it is RGB and all its rows have the filter of `encode_png`,
+    otherwise with Pillow.
+    """
+    height, width = file.height, file.width
+    data = _inflate(file)
+    rows = np.frombuffer(data, np.uint8).reshape(height, file.row_bytes)
+    if file.channels == 3 and not (rows[:, 0] != _UP).any():
+        return np.add.accumulate(rows[:, 1:], axis=0, dtype=np.uint8).reshape(height, width, 3)
+    return _decode_rows(file, data)
 
-    Only the chunks that the pixels need are passed to Pillow. It would read all other chunks in
-    Python, and raises its own kinds of errors for some invalid ones.
+
+def _inflate(file: ImageFile) -> bytes:
+    """Return the unpacked rows of a PNG file, each with the byte of its filter.
+
+    The data may consist of descriptions of Huffman tables that decode to almost nothing, so that
+    their size does not bound the time. They are therefore unpacked in slices, as long as the time
+    is in proportion to the estimate.
+    """
+    size = file.height * file.row_bytes
+    end_s = time.thread_time() + _INFLATE_FACTOR * file.decoding_s
+    inflate = zlib.decompressobj()
+    rows: list[bytes] = []
+    missing = size
+    try:
+        for part in _slices(file):
+            if rows and time.thread_time() > end_s:
+                raise MessageTooLarge(
+                    "image: unpacking this PNG takes several times as long as its pixels need; "
+                    "encode it again, or send JPEG"
+                )
+            rows.append(inflate.decompress(part, missing + 1))
+            missing -= len(rows[-1])
+            if missing < 0 or inflate.eof:
+                break
+    except zlib.error as error:
+        raise MalformedMessage(f"image: broken PNG ({error})") from error
+    # Zlib checks the checksum at the end of the data.
+    if missing or not inflate.eof:
+        raise MalformedMessage(
+            f"image: broken PNG (its data are not {file.height} rows of {file.width} pixels)"
+        )
+    return b"".join(rows)
+
+
+def _slices(file: ImageFile) -> Iterator[memoryview]:
+    """Yield the compressed data of a PNG file in slices."""
+    slice_bytes = max(_SLICE_BYTES, len(file.data) // _SLICES)
+    data = memoryview(file.data)
+    for name, start, end in file.chunks:
+        if name == b"IDAT":
+            # The first 8 bytes of a chunk are its size and name, and the last 4 its checksum.
+            for at in range(start + 8, end - 4, slice_bytes):
+                yield data[at : min(at + slice_bytes, end - 4)]
+
+
+def _decode_rows(file: ImageFile, rows: bytes) -> np.ndarray:
+    """Decode the unpacked rows of a PNG with Pillow.
+
+    Pillow receives a file with only the chunks that the pixels need, in which the rows are stored
+    without compression. It would read all other chunks in Python, and raises its own kinds of
+    errors for some invalid ones.
     """
     try:
         from PIL import Image
@@ -112,45 +179,19 @@ def _decode_png(file: ImageFile) -> np.ndarray:
         from vlagents_ray.registry import pip_install
 
         raise MissingDependency(f"PNG images need Pillow; {pip_install('serve')}") from error
-    data = b"".join([PNG_MAGIC, *(file.data[start:end] for _, start, end in file.chunks)])
+    head = [file.data[start:end] for name, start, end in file.chunks if name in (b"IHDR", b"PLTE")]
+    data = b"".join(
+        [PNG_MAGIC, *head, _chunk(b"IDAT", zlib.compress(rows, 0)), _chunk(b"IEND", b"")]
+    )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data), formats=("PNG",)) as picture:
-                # Keep the upper 8 of 16 bits, as Pillow does for colours. For greys, Pillow would
-                # clip the values.
-                if picture.mode.startswith("I"):  # "I;16", or "I" before Pillow 11
-                    grey = (np.asarray(picture) >> 8).astype(np.uint8)
-                    return np.repeat(grey[:, :, None], 3, axis=2)
                 return np.array(picture if picture.mode == "RGB" else picture.convert("RGB"))
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise MessageTooLarge(f"image: {error}") from error
     except (OSError, ValueError, SyntaxError) as error:
         raise MalformedMessage(f"image: broken PNG ({error})") from error
-
-
-def _decode_own_png(file: ImageFile) -> np.ndarray | None:
-    """Decode a file in the form that `encode_png` writes, with only the memory that its size needs.
-
-    Return None if rows have other filters.
-    """
-    height, width = file.height, file.width
-    _, start, end = file.chunks[1]
-    stride = 1 + width * 3
-    inflate = zlib.decompressobj()
-    try:
-        raw = inflate.decompress(memoryview(file.data)[start + 8 : end - 4], height * stride + 1)
-    except zlib.error as error:
-        raise MalformedMessage(f"image: broken PNG ({error})") from error
-    # Zlib checks the checksum at the end of the data.
-    if len(raw) != height * stride or not inflate.eof:
-        raise MalformedMessage(
-            f"image: broken PNG (its data are not {height} rows of {width} pixels)"
-        )
-    rows = np.frombuffer(raw, np.uint8).reshape(height, stride)
-    if (rows[:, 0] != _UP).any():
-        return None
-    return np.add.accumulate(rows[:, 1:], axis=0, dtype=np.uint8).reshape(height, width, 3)
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

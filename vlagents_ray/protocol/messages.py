@@ -404,12 +404,15 @@ class Budget:
         self.count(size)
 
     @contextlib.contextmanager
-    def decoding(self, seconds: float, scratch_bytes: int) -> Iterator[None]:
+    def decoding(
+        self, seconds: float, scratch_bytes: int, *, is_bounded: bool = True
+    ) -> Iterator[None]:
         """Count the decoding of images before it begins; raise an error if it exceeds a limit.
 
         Args:
             seconds: Estimated duration of the decoding on one core, s.
             scratch_bytes: Temporary memory of the decoding, in addition to the images, bytes.
+            is_bounded: Whether all images are JPEG, whose pixels bound the duration.
         """
         self._seconds_left -= seconds
         if self._seconds_left < 0:
@@ -419,6 +422,18 @@ class Budget:
                 "the allowed time is proportional"
             )
         yield
+
+    def spend(self, seconds: float) -> None:
+        """Count the CPU time that checking and decoding images took, s."""
+
+    def image_of(self, _file: bytes) -> np.ndarray | None:
+        """Return the image of the next file if it was decoded before the message was read again;
+        None otherwise.
+        """
+        return None
+
+    def keep_image(self, file: bytes, image: np.ndarray) -> None:
+        """Keep the decoded image of the next file, in case the message has to be read again."""
 
 
 # A probe tests the link. It is answered immediately, without a session or the policy. It consists

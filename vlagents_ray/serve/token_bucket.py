@@ -24,13 +24,21 @@ class TokenBucket:
 
         The number must not exceed the capacity.
         """
-        self._tokens = min(self._capacity, self._tokens + (now - self._refilled) * self.rate)
-        self._refilled = now
+        self._refill(now)
         if self._tokens < number:
             return (number - self._tokens) / self.rate
         self._tokens -= number
         return 0.0
 
+    def owe(self, now: float, number: float) -> None:
+        """Take `number` tokens even if there are fewer; `take` then waits for the difference."""
+        self._refill(now)
+        self._tokens -= number
+
     def give_back(self, number: int = 1) -> None:
         """Return tokens that were taken but not needed."""
         self._tokens += number
+
+    def _refill(self, now: float) -> None:
+        self._tokens = min(self._capacity, self._tokens + (now - self._refilled) * self.rate)
+        self._refilled = now

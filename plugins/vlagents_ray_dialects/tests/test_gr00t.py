@@ -455,6 +455,25 @@ def test_nothing_of_a_message_is_read_before_its_key(
     assert not read
 
 
+@pytest.mark.parametrize("before", [0, 1, 15])
+def test_the_key_is_found_among_the_first_fields(before: int) -> None:
+    fields = {f"field-{index}": {"nested": [index] * 10} for index in range(before)}
+    message = msgpack.packb({**fields, "api_token": "key", "data": [[1] * 100]})
+    assert gr00t_codec.read_token(message, LIMITS) == "key"
+
+
+def test_a_key_behind_many_fields_or_a_name_with_many_values_is_not_searched() -> None:
+    many = {str(index): index for index in range(9_000)}
+    assert gr00t_codec.read_token(msgpack.packb({**many, "api_token": "key"}), LIMITS) is None
+    names = (
+        b"\x82" + msgpack.packb(many) + b"\x01" + msgpack.packb("api_token") + msgpack.packb("key")
+    )
+    with pytest.raises(MalformedMessage):
+        gr00t_codec.read_token(names, LIMITS)
+    with pytest.raises(MalformedMessage):
+        gr00t_codec.read_token(msgpack.packb({"api_token": many}), LIMITS)
+
+
 def _raw(port: int, message: bytes) -> bytes:
     with zmq.Context() as context, context.socket(zmq.REQ) as client:
         client.setsockopt(zmq.LINGER, 0)

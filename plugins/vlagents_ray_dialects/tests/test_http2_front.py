@@ -47,11 +47,17 @@ def test_small_frames_are_counted_wherever_the_bytes_are_split(
     assert counted == sum(size < 4096 for size in sizes)
 
 
-def test_a_cancellation_counts_as_eight_small_frames_of_any_size() -> None:
+def test_a_cancellation_counts_as_eight_small_frames() -> None:
     cancellation = b"\0\0\x04\x03\0\0\0\0\x01" + b"\0\0\0\x08"
     assert FrameCounter().count(cancellation * 3 + SETTINGS) == 3 * 8 + 1
-    long_cancellation = (5000).to_bytes(3, "big") + cancellation[3:9] + bytes(5000)
-    assert FrameCounter().count(long_cancellation) == 8
+
+
+@pytest.mark.parametrize("kind", range(1, 12))
+@pytest.mark.parametrize("size", [0, 63, 64, 700, 4095, 4096, 5000, 16384])
+def test_a_frame_without_data_counts_by_its_size(kind: int, size: int) -> None:
+    """No size is free: SETTINGS of 4.2 kB, above the bound of small frames, have 700 entries."""
+    frame = size.to_bytes(3, "big") + bytes([kind, 0, 0, 0, 0, 1]) + bytes(size)
+    assert FrameCounter().count(frame) == max(8 if kind == 3 else 1, size // 64)
 
 
 @given(st.lists(st.binary(max_size=100), max_size=20))

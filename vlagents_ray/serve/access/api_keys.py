@@ -153,11 +153,7 @@ class Keys:
 
         now = time.monotonic()
         with self._lock:
-            bucket = self._buckets.get(key.name)
-            if bucket is None or bucket.rate != key.rate:
-                bucket = self._buckets[key.name] = TokenBucket(key.rate, now)
-                self._unread_until.pop(key.name, None)
-            wait_s = bucket.take(now)
+            wait_s = self._bucket(key.name, key.rate, now).take(now)
             if wait_s > 0:
                 shortest_s, longest_s = _THROTTLED_S
                 self._unread_until[key.name] = now + min(longest_s, max(shortest_s, wait_s))
@@ -169,6 +165,21 @@ class Keys:
             )
             error.retry_after_s = wait_s
             raise error
+
+    def owe(self, key: Key, requests: float) -> None:
+        """Count `requests` more requests of `key`, which have been executed."""
+        if key.rate is not None:
+            now = time.monotonic()
+            with self._lock:
+                self._bucket(key.name, key.rate, now).owe(now, requests)
+
+    def _bucket(self, name: str, rate: float, now: float) -> TokenBucket:
+        """Return the bucket of a key with a rate; the caller holds the lock."""
+        bucket = self._buckets.get(name)
+        if bucket is None or bucket.rate != rate:
+            bucket = self._buckets[name] = TokenBucket(rate, now)
+            self._unread_until.pop(name, None)
+        return bucket
 
     def throttled_s(self, name: str) -> float:
         """Return the time for which the key's connections are not read, s; 0 if the key has not
@@ -329,6 +340,12 @@ class Caller:
             self._keys.audit.refused(self.name, error.code)
             raise
         return key
+
+    def owe(self, requests: float) -> None:
+        """Count `requests` more requests towards the rate of the key, without rejecting them."""
+        key = self._keys.key(self._digest)
+        if key is not None:
+            self._keys.owe(key, requests)
 
     def refusal(self, scope: str | None = None) -> str | None:
         """Return the reason why the key is no longer valid or lacks the `scope`; None if it is

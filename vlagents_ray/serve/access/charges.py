@@ -18,6 +18,8 @@ What is charged to the rate of a key:
 
 - A message costs as much as it has requests, but at least one. This includes messages that cannot
   be parsed, probes of the link, and an HTTP request to any path that needs a key.
+- A message whose images take more than `REQUEST_DECODING_S` for each of these requests to decode
+  costs one request for each `REQUEST_DECODING_S`.
 - Closing a session is free, unless the message has no other request.
 - A reset that the server adds at the beginning of an episode is free.
 - A control frame is free within `CONTROL_FRAMES_PER_S`. Above that rate, the connection costs one
@@ -50,6 +52,9 @@ REFUSALS = 8
 # client of this package sends none; without a key, a rate does not limit them.
 _MALFORMED = 8
 _MALFORMED_PER_S = 10.0
+# CPU time of decoding images that a request includes, s. A robot with four cameras of 1920x1080
+# needs about half of it.
+REQUEST_DECODING_S = 0.1
 REFUSED = f"over the rate of its key {REFUSALS} times in a row; send less, or raise the rate"
 
 
@@ -168,7 +173,7 @@ class Charge:
     Not thread-safe.
     """
 
-    __slots__ = ("_charged", "_refusal", "caller", "is_robot")
+    __slots__ = ("_charged", "_decoding_s", "_refusal", "caller", "is_robot")
 
     def __init__(
         self, caller: Identity, *, refusal: VLAgentsError | None = None, is_robot: bool = True
@@ -184,7 +189,8 @@ class Charge:
         # The holder of the key that is charged; None without a key.
         self.caller = caller if isinstance(caller, Caller) else None
         self._refusal = refusal
-        self._charged = 1  # number of requests that were charged to the key
+        self._charged = 1.0  # number of requests that were charged to the key
+        self._decoding_s = 0.0  # CPU time of decoding the images of the message so far, s
 
     @property
     def key(self) -> str | None:
@@ -220,6 +226,18 @@ class Charge:
         while self._charged < requests:
             caller.take_request()
             self._charged += 1
+
+    def spend(self, seconds: float) -> None:
+        """Charge CPU time of decoding the images of the message, s, beyond what the charged
+        requests include. The key's next messages wait for it.
+        """
+        if self.caller is None:
+            return
+        self._decoding_s += seconds
+        more = self._decoding_s / REQUEST_DECODING_S - self._charged
+        if more > 0:
+            self.caller.owe(more)
+            self._charged += more
 
 
 def free(reason: NoKey) -> Charge:

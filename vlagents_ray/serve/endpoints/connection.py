@@ -247,7 +247,7 @@ class PolledConnection(ABC):
         try:
             if long:
                 raise NeedsDecodingThread
-            decoded = read(admission)
+            decoded = admission.decode_here(read)
         except NeedsDecodingThread:
             then = partial(self._decoded, submit, refuse)
             decoding = admission.decode_on_thread(read)

@@ -60,6 +60,9 @@ from vlagents_ray.serve.requests import IncomingMessage
 
 HEAD_BYTES = 16 * 1024  # maximum size of a request's head
 END_OF_HEAD = b"\r\n\r\n"
+# Maximum number of fields of a head, about as at the server's port, where HAProxy allows 101. Each
+# field takes as long as hundreds of bytes, before the key is known.
+MOST_FIELDS = 100
 # Larger forms are read on another thread, since finding the end of each part takes time.
 _INLINE_FORM_BYTES = 2**20
 # Maximum number of bytes of a body with chunks that are read at once, since a chunk of one byte
@@ -149,8 +152,14 @@ class _Reading:
         self.is_complete = True
 
 
+def is_too_large(head: bytes) -> bool:
+    """Return whether a head, or its received part, exceeds the limits of its size and fields."""
+    # The request and the end of the head are two further lines.
+    return len(head) > HEAD_BYTES or head.count(b"\n") > MOST_FIELDS + 2
+
+
 def read_head(data: bytes) -> _Reading:
-    """Parse the head of a request.
+    """Parse the head of a request, which is not too large.
 
     Raises:
         MalformedMessage: The bytes are not HTTP, or a header is not UTF-8.
@@ -345,10 +354,9 @@ class HttpConnection(MessageConnection):
         if not self._head:
             self._request_id = self._name = ""
         self._head += data
-        is_too_long = len(self._head) > HEAD_BYTES
-        if is_too_long or self._head.endswith(END_OF_HEAD):
+        if self._head.endswith(END_OF_HEAD) or is_too_large(self._head):
             head, self._head = self._head, b""
-            self.begin(b"" if is_too_long else head)
+            self.begin(b"" if is_too_large(head) else head)
 
     def take_over(self, head: bytes) -> None:
         """Serve the first request, whose `head` was read before this object existed; see `begin`.
@@ -358,11 +366,14 @@ class HttpConnection(MessageConnection):
 
     def begin(self, head: bytes) -> None:
         """Serve a request whose whole head has arrived; an empty `head` stands for a head that is
-        too long, which is rejected.
+        too large, which is rejected.
         """
         try:
             if not head:
-                raise MalformedMessage(f"head: over {HEAD_BYTES} bytes, the limit; send less")
+                raise MalformedMessage(
+                    f"head: expected at most {HEAD_BYTES} bytes and {MOST_FIELDS} fields, got "
+                    "more; send fewer header fields"
+                )
             reading = read_head(head)
         except MalformedMessage as error:
             status = 400 if head else _HEAD_TOO_LARGE

@@ -47,6 +47,7 @@ from vlagents_ray.serve.endpoints.http_connection import (
     HttpConnection,
     HttpServer,
     head_bytes,
+    is_too_large,
 )
 from vlagents_ray.serve.endpoints.message_connection import MessageConnection
 from vlagents_ray.serve.endpoints.request_stream import RequestStream
@@ -165,7 +166,7 @@ class OwnPortServer(HttpServer):
 
     def serve_http(self, client: PortConnection, connection: socket.socket, head: bytes) -> None:
         """Serve a connection whose first head belongs to an HTTP request; the head is empty if it
-        is too long.
+        is too large.
         """
         successor = HttpConnection(self, connection)
         client.replace_by(successor)
@@ -226,13 +227,13 @@ class PortConnection(WebSocketConnection):
             self.disconnect()
             return False
         self._head += data
-        is_too_long = len(self._head) > HEAD_BYTES
-        if not (is_too_long or self._head.endswith(END_OF_HEAD)):
+        is_rejected = is_too_large(self._head)
+        if not (is_rejected or self._head.endswith(END_OF_HEAD)):
             return False
 
         head, self._head = self._head, b""
-        if is_too_long or not _HANDSHAKE.search(head):
-            self._server.serve_http(self, self._connection, b"" if is_too_long else head)
+        if is_rejected or not _HANDSHAKE.search(head):
+            self._server.serve_http(self, self._connection, b"" if is_rejected else head)
         elif not self._accept_handshake(head):
             self._refuse_handshake()
         return False

@@ -11,9 +11,11 @@ A message has a `MessageAdmission` from its arrival until it is answered. Decode
   key's bytes a second.
 - All messages of a replica together take at most `limits.in_flight_bytes`; a quarter is reserved
   for robots (503).
-- Images of more than a megapixel or 8 ms and headers of more than 64 KiB are decoded on separate
-  threads, so that neither the policy's thread nor an event loop waits for them. Messages of
-  simulations are decoded on half of the cores.
+- The thread that reads a message, which is the policy's thread or an event loop, decodes only JPEG
+  of at most a quarter of a megapixel in all, whose cost is bounded. Other images, and headers of
+  more than 64 KiB, are decoded on separate threads. Messages of simulations, and messages whose
+  images take longer than 60 ms, are decoded on half of the cores.
+- The CPU time of decoding is charged to the key.
 - While batches are slow and several sessions act, images of robots that take more than 0.4 ms are
   also decoded on these threads, if there are four cores. Robots that are answered together send
   their next messages together, and one thread would decode these one after another.
@@ -30,6 +32,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
+
 from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable
 from vlagents_ray.images import thread_map
 from vlagents_ray.protocol.messages import Budget, MessageLimits, Request
@@ -37,10 +41,13 @@ from vlagents_ray.serve.access.charges import Charge
 
 T = TypeVar("T")
 
-# Limits above which another thread decodes: the decoded bytes of a megapixel, and the time in which
-# one core decodes such a JPEG.
-INLINE_BYTES = 3 * 2**20
-INLINE_S = 8e-3
+# Limits above which another thread decodes: the decoded bytes of a quarter of a megapixel, and the
+# time in which one core decodes such a JPEG of the highest quality.
+INLINE_BYTES = 3 * 2**18
+INLINE_S = 4e-3
+# The time above which a robot's message is not decoded on the threads for robots, s, so that other
+# robots do not wait for longer than two ticks: about the time of four images of 1920x1080.
+LONG_S = 60e-3
 # Time limit while the messages of several sessions are decoded in parallel, s. A shorter decoding
 # takes about as long as the thread switch.
 SIDE_BY_SIDE_S = 0.4e-3
@@ -262,6 +269,10 @@ class Admission:
         is_side_by_side = robot and self._window is not None and self._window.overlaps
         return self.least_inline_s if is_side_by_side else INLINE_S
 
+    def has_spare_cores(self) -> bool:
+        """Return whether the images of a long message are decoded on several threads."""
+        return thread_map.allowed() >= SIDE_BY_SIDE_CORES
+
     def fills_cores(self) -> bool:
         """Return whether the messages of robots that are being decoded keep all cores busy with one
         thread for each message. If not, the two or three images of a message are decoded on several
@@ -314,7 +325,10 @@ class MessageAdmission(Budget):
         "_decoded",
         "_decoding_s",
         "_held",
+        "_images",
+        "_images_used",
         "_inline",
+        "_is_short",
         "_key",
         "_requests",
         "_robot",
@@ -360,6 +374,13 @@ class MessageAdmission(Budget):
         self._decoding_s = 0.0  # estimated time of decoding the images so far, s
         self._requests = 0  # number of requests so far that are charged
         self._inline = inline
+        # Whether a thread for robots decodes the message, so that a long message is decoded
+        # elsewhere.
+        self._is_short = False
+        # The decoded files and their images in order, while another thread may have to read the
+        # message again, and the number of images that this thread has used.
+        self._images: list[tuple[bytes, np.ndarray]] = []
+        self._images_used = 0
 
     def begin_message(self) -> None:
         """Raise an error if the message is rejected, as in `Budget`. The message was charged when
@@ -388,7 +409,8 @@ class MessageAdmission(Budget):
 
         # An inline message is small, and is decoded on a thread with other work.
         if not self._inline:
-            self.serial = not self._robot or self._admission.fills_cores()
+            is_parallel = self._robot and (self._is_short or self._admission.has_spare_cores())
+            self.serial = not is_parallel or self._admission.fills_cores()
         if self.size:
             self.grow(self.size)
             self.size = 0
@@ -416,13 +438,19 @@ class MessageAdmission(Budget):
         self._decoded += size
 
     @contextlib.contextmanager
-    def decoding(self, seconds: float, scratch_bytes: int) -> Iterator[None]:
+    def decoding(
+        self, seconds: float, scratch_bytes: int, *, is_bounded: bool = True
+    ) -> Iterator[None]:
         """Count the decoding of images, as in `Budget`; raise `NeedsDecodingThread` if it takes
         too long here.
         """
         self._decoding_s += seconds
+        if self._inline and not is_bounded:
+            raise NeedsDecodingThread
         may_take_long = self._inline and self._decoding_s > self._admission.least_inline_s
         if may_take_long and self._decoding_s > self._admission.inline_s(self._robot):
+            raise NeedsDecodingThread
+        if self._is_short and self._decoding_s > LONG_S:
             raise NeedsDecodingThread
         with super().decoding(seconds, scratch_bytes):
             self.receive(scratch_bytes)
@@ -432,18 +460,84 @@ class MessageAdmission(Budget):
                 self._admission.release(scratch_bytes, self._key)
                 self._held -= scratch_bytes
 
+    def spend(self, seconds: float) -> None:
+        """Charge the CPU time of decoding to the key, as in `Budget`."""
+        self.charge.spend(seconds)
+
+    def image_of(self, file: bytes) -> np.ndarray | None:
+        """Return the image of the next file if it was decoded before, as in `Budget`."""
+        if self._images_used < len(self._images):
+            known_file, image = self._images[self._images_used]
+            if known_file == file:
+                self._images_used += 1
+                return image
+            # The sender has changed the message in shared memory.
+            del self._images[self._images_used :]
+        return None
+
+    def keep_image(self, file: bytes, image: np.ndarray) -> None:
+        """Keep the decoded image of the next file, as in `Budget`."""
+        if self._inline or self._is_short:
+            self._images.append((file, image))
+            self._images_used += 1
+
+    def decode_here(self, read: Callable[[Budget], T]) -> T:
+        """Decode with `read` on this thread, and return the result; raise `NeedsDecodingThread` if
+        another thread has to read the message again.
+        """
+        result = read(self)
+        self._images = []
+        return result
+
     def decode_on_thread(self, read: Callable[[Budget], T]) -> Future[T]:
         """Decode with `read` on a decoding thread, and return the future; raise
         `PolicyUnavailable` after `close`.
         """
+        self._is_short = self._robot
+        self._begin_again()
+        job = self._admission.submit(lambda: self.decode_here(read), self._robot)
+        if not self._robot:
+            return job
+
+        done: Future[T] = Future()
+
+        def finish(job: Future[T]) -> None:
+            """Return the result, or decode a long message on the threads for others."""
+            if job.cancelled():
+                done.cancel()
+                done.set_running_or_notify_cancel()
+                return
+            error = job.exception()
+            if isinstance(error, NeedsDecodingThread):
+                self._is_short = False
+                self._begin_again()
+                try:
+                    long_job = self._admission.submit(lambda: self.decode_here(read), False)
+                except PolicyUnavailable as stopping:
+                    error = stopping
+                else:
+                    long_job.add_done_callback(finish)
+                    return
+            if not done.set_running_or_notify_cancel():
+                return
+            if error is None:
+                done.set_result(job.result())
+            else:
+                done.set_exception(error)
+
+        job.add_done_callback(finish)
+        return done
+
+    def _begin_again(self) -> None:
+        """Prepare for another thread that reads the message from its beginning."""
         self._admission.release(self._decoded, self._key)
         self._held -= self._decoded
         self._decoded = 0
         self._decoding_s = 0.0
         self._refill()
         self._requests = 0  # the requests are read again, and each request is charged only once
+        self._images_used = 0
         self._inline = False
-        return self._admission.submit(lambda: read(self), self._robot)
 
     async def decoded(self, read: Callable[[Budget], T], *, long: bool = False) -> T:
         """Decode with `read` and return the result; if it is `long`, the images are large, or a
@@ -451,7 +545,7 @@ class MessageAdmission(Budget):
         """
         if self._inline and not long:
             try:
-                return read(self)
+                return self.decode_here(read)
             except NeedsDecodingThread:
                 pass
         return await asyncio.wrap_future(self.decode_on_thread(read))
@@ -459,6 +553,7 @@ class MessageAdmission(Budget):
     def release(self) -> None:
         """Release the bytes of a message that is answered or dropped."""
         held_bytes, self._held, self._decoded = self._held, 0, 0
+        self._images = []
         if held_bytes:
             self._admission.release(held_bytes, self._key)
 

@@ -56,6 +56,9 @@ class Observations:
 
 
 _TOKEN_BYTES = 4096  # maximum size of an API key, and of the names of the fields before it
+# The number of fields among which the API key must be. GR00T's clients send at most three, and
+# skipping 10,000 fields takes 2 ms, before it is known whether the sender has a key.
+_TOKEN_FIELDS = 16
 
 
 def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None:
@@ -66,7 +69,7 @@ def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None
         limits: The limits of its size.
 
     Returns:
-        The key; None if the message has none.
+        The key; None if the message has none among its first fields.
 
     Raises:
         MalformedMessage: The message is not a map, or the key is not a text.
@@ -81,12 +84,12 @@ def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None
     reader = package.Unpacker(
         max_buffer_size=limits.body_bytes,
         max_array_len=0,
-        max_map_len=limits.items,
+        max_map_len=0,  # of a field's name; fields of any size are skipped
         max_str_len=_TOKEN_BYTES,
     )
     try:
         reader.feed(payload)
-        for _ in range(reader.read_map_header()):
+        for _ in range(min(_TOKEN_FIELDS, reader.read_map_header())):
             if reader.unpack() != "api_token":
                 reader.skip()
                 continue

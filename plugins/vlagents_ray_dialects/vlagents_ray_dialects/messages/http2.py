@@ -8,11 +8,14 @@ PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 _HEAD_BYTES = 9
 # The number of bytes at the beginning of a frame's head that contain the size of the payload.
 _SIZE_BYTES = 3
-# Frames with a larger payload are not counted, since the limits of bytes cover them. Clients send
-# messages in frames of 16 KiB.
-_SMALL_BYTES = 4096
 _TYPE = 3  # index of the type of a frame in its head
-_CANCELLATION = 3  # RST_STREAM, the type of a frame that cancels a request
+_DATA, _CANCELLATION = 0, 3  # DATA, and RST_STREAM, which cancels a request: types of frames
+# DATA frames with a larger payload are not counted, since the limits of bytes cover them. Clients
+# send messages in frames of 16 KiB.
+_SMALL_BYTES = 4096
+# gRPC parses the payload of any other frame, such as the entries of SETTINGS and the fields of
+# HEADERS, in entries of a few bytes: that many bytes cost as much as a small frame.
+_BYTES_OF_A_FRAME = 64
 # A robot cancels a request only after a timeout. Beginning and cancelling a request costs its
 # sender 30 bytes, and costs gRPC's server the beginning and the end of a call.
 _FRAMES_OF_A_CANCELLATION = 8
@@ -21,7 +24,8 @@ _FRAMES_OF_A_CANCELLATION = 8
 class FrameCounter:
     """Counts the small frames in the bytes that a client sends after its preface.
 
-    A cancellation counts as `_FRAMES_OF_A_CANCELLATION`. Control frames (PING, SETTINGS,
+    A cancellation counts as `_FRAMES_OF_A_CANCELLATION`. A frame without data counts once for each
+    `_BYTES_OF_A_FRAME` of its payload, and at least once. Control frames (PING, SETTINGS,
     WINDOW_UPDATE), begun and cancelled requests, and messages in tiny pieces are all small frames.
     A small frame costs its sender a few bytes, but costs gRPC's library as much as a new
     connection.
@@ -49,10 +53,16 @@ class FrameCounter:
             start = end
             if len(self._head) == _HEAD_BYTES:
                 self._missing_bytes = int.from_bytes(self._head[:_SIZE_BYTES], "big")
-                is_cancellation = self._head[_TYPE] == _CANCELLATION
+                small_frames += _cost_of_frame(self._head[_TYPE], self._missing_bytes)
                 self._head = b""
-                if is_cancellation:
-                    small_frames += _FRAMES_OF_A_CANCELLATION
-                elif self._missing_bytes < _SMALL_BYTES:
-                    small_frames += 1
         return small_frames
+
+
+def _cost_of_frame(kind: int, size: int) -> int:
+    """Return the number of small frames that cost as much as a frame with a payload of `size`
+    bytes.
+    """
+    if kind == _DATA:
+        return int(size < _SMALL_BYTES)
+    least = _FRAMES_OF_A_CANCELLATION if kind == _CANCELLATION else 1
+    return max(least, size // _BYTES_OF_A_FRAME)
