@@ -94,8 +94,9 @@ class RemoteRobot:
             self._zenoh.close()
             self._zenoh = None
 
-    def query(self, key: str, request: Envelope) -> Envelope:
+    def query(self, key: str, request: Envelope | bytes) -> Envelope:
         """Send a query, and return its only reply."""
+        data = messages.encode(request) if isinstance(request, Envelope) else request
         with self._zenoh.declare_querier(key) as querier:
             deadline = time.monotonic() + _WAIT_S
             while not querier.matching_status.matching:
@@ -111,7 +112,7 @@ class RemoteRobot:
                 drop=is_over.set,
                 indirect=False,
             ),
-            payload=messages.encode(request),
+            payload=data,
             timeout=_WAIT_S,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
@@ -120,9 +121,9 @@ class RemoteRobot:
         [reply] = replies
         return messages.decode(reply)
 
-    def open(self, request_id: str = "", **changes: Any) -> Envelope:
-        """Request a session."""
-        body = {
+    def open_body(self, **changes: Any) -> dict[str, Any]:
+        """Return the body of a request for a session."""
+        return {
             "expected_artifact": self.descriptor["artifact_identity"],
             "features": [on_wire(FRONT), on_wire(STATE)],
             "action_feature": on_wire(ACTION),
@@ -132,14 +133,20 @@ class RemoteRobot:
             "encoding": "raw",
             **changes,
         }
+
+    def open(self, request_id: str = "", **changes: Any) -> Envelope:
+        """Request a session."""
         request = Envelope(
-            "open", self.instance_id, request_id=request_id or uuid.uuid4().hex, body=body
+            "open",
+            self.instance_id,
+            request_id=request_id or uuid.uuid4().hex,
+            body=self.open_body(**changes),
         )
         return self.query(f"{self.instance_key}/open", request)
 
-    def begin(self, **changes: Any) -> RemoteRobot:
+    def begin(self, request_id: str = "", **changes: Any) -> RemoteRobot:
         """Open a session and reset it, as LeRobot's client does."""
-        self.accepted = self.open(**changes)
+        self.accepted = self.open(request_id, **changes)
         assert self.accepted.message_type == "accepted", self.accepted
         self.session_id = self.accepted.session_id
         key = self.session_key
@@ -172,8 +179,26 @@ class RemoteRobot:
         )
         return self.query(f"{self.session_key}/control", request)
 
+    def answer_to(self, kind: str, data: bytes) -> Envelope:
+        """Send the bytes of an observation (`obs`), of a control message (`control`) or of a
+        question (`open`, `describe`), and return the answer.
+        """
+        if kind == "obs":
+            self.publish("obs", data)
+            return self.answers.get(timeout=_WAIT_S)
+        keys = {"control": self.session_key, "open": self.instance_key, "describe": self._key}
+        return self.query(f"{keys[kind]}/{kind}", data)
+
     def send(self, pixel: int, task: str = "abc", features: Any = None, **changes: Any) -> Envelope:
         """Publish an observation."""
+        request = self.observation(pixel, task, features, **changes)
+        self.publish("obs", messages.encode(request))
+        return request
+
+    def observation(
+        self, pixel: int, task: str = "abc", features: Any = None, **changes: Any
+    ) -> Envelope:
+        """Return the next observation."""
         self.sequence += 1
         image = np.full((8, 8, 3), pixel, np.uint8)
         if features is None:
@@ -195,7 +220,7 @@ class RemoteRobot:
             "cursor": 0,
             **changes,
         }
-        request = Envelope(
+        return Envelope(
             "observation",
             self.instance_id,
             self.session_id,
@@ -203,11 +228,9 @@ class RemoteRobot:
             f"r{self.sequence}",
             body,
         )
-        self.publish("obs", messages.encode(request))
-        return request
 
-    def publish(self, suffix: str, data: bytes) -> None:
-        self._zenoh.put(f"{self.session_key}/{suffix}", data)
+    def publish(self, suffix: str, data: bytes, **options: Any) -> None:
+        self._zenoh.put(f"{self.session_key}/{suffix}", data, **options)
 
     def act(self, pixel: int, task: str = "abc", **changes: Any) -> Envelope:
         """Send an observation, and return the answer."""

@@ -6,15 +6,15 @@ import json
 from typing import Any
 
 
-def open_zenoh(port: int) -> Any:
-    """Return a session that connects only to the peer at `port`: it does not scout, and does not
-    use shared memory.
+def open_zenoh(port: int, mode: str = "peer") -> Any:
+    """Return a session in the mode `peer` or `client`, which connects only to the peer at `port`:
+    it does not scout, and does not use shared memory.
     """
     import zenoh  # the tests without extras lack zenoh
 
     config = zenoh.Config()
     settings = {
-        "mode": "peer",
+        "mode": mode,
         "connect/endpoints": [f"tcp/127.0.0.1:{port}"],
         "listen/endpoints": [],
         "scouting/multicast/enabled": False,

@@ -129,13 +129,17 @@ def test_images_may_be_jpeg(open_remote: Open) -> None:
         assert abs(first_row(robot.act(0, features=features))[0] - 128) <= 1
 
 
-def test_a_repeated_question_for_a_session_gets_the_same_one(
+def test_a_connection_has_one_session_and_the_newest_question_begins_it(
     open_remote: Open, replicas: Replicas
 ) -> None:
     with RemoteRobot(open_remote()) as robot:
-        first, again, other = robot.open("q-1"), robot.open("q-1"), robot.open("q-2")
-        assert first.session_id == again.session_id != other.session_id
-        assert first.body["capabilities"] == robot.descriptor["capabilities"]
+        robot.begin()
+        assert first_row(robot.act(1))[4] == 1
+        ids = [robot.session_id, *(robot.open("q-1").session_id for _ in range(2))]
+        assert len(set(ids)) == 3
+        wait_for(lambda: sessions(replicas) == 0)
+        robot.begin()
+        assert first_row(robot.act(1))[4] == 1
 
 
 ALIGNED: dict[str, tuple[list[str], dict[str, Any]]] = {
@@ -225,8 +229,9 @@ REFUSED: dict[str, tuple[dict[str, Any], str, str]] = {
 
 
 def test_a_robot_that_does_not_fit_is_told_what_differs(
-    open_remote: Open, replicas: Replicas
+    open_remote: Open, replicas: Replicas, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("vlagents_ray_dialects.lerobot_remote._OPENS_AT_ONCE", 100)
     with RemoteRobot(open_remote()) as robot:
         for name, (changes, code, expected) in REFUSED.items():
             got, message = error_of(robot.open(**changes))

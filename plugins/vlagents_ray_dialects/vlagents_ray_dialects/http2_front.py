@@ -9,10 +9,7 @@ connection that sends more small frames than a robot needs.
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import socket
-import struct
 import tempfile
 import threading
 import time
@@ -20,20 +17,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from vlagents_ray.errors import MalformedMessage
-from vlagents_ray.serve.endpoints.connection import ANSWERS_S, wait_delivered
 from vlagents_ray.serve.token_bucket import TokenBucket
-from vlagents_ray_dialects.client_reader import set_keep_alive, share_of, shut_down
+from vlagents_ray_dialects.client_reader import share_of
+from vlagents_ray_dialects.forwarding import SHORT_FOLDER, ForwardedConnection
 from vlagents_ray_dialects.messages.http2 import PREFACE, FrameCounter
 
-logger = logging.getLogger(__name__)
-
-# The path of a socket has at most 107 bytes. Only the user of this process can read the folder that
-# is created here.
-_SHORT_FOLDER = "/tmp"  # noqa: S108
 _HANDSHAKE_S = 5.0  # maximum time until the preface of a client
-_SEND_S = 10.0  # maximum time for a client to accept a piece of an answer
 _END_S = 3.0  # maximum time for the last answers when the front is closed
-_READ_BYTES = 64 * 1024
 # A robot sends about four small frames with each request, and at most 7 at once. At 30 Hz, with two
 # requests for each observation, it sends 270 in a second.
 _FRAMES_PER_S = 300.0
@@ -60,11 +50,11 @@ class Http2Front:
     def __init__(self, name: str, is_client: Callable[[str], bool]) -> None:
         self.name = name
         self._is_client = is_client
-        self._folder = tempfile.TemporaryDirectory(prefix="vlr-", dir=_SHORT_FOLDER)
+        self._folder = tempfile.TemporaryDirectory(prefix="vlr-", dir=SHORT_FOLDER)
         self.path = str(Path(self._folder.name, "grpc"))
         self._lock = threading.Lock()  # guards the next two fields
         # The open connections, the oldest first.
-        self._connections: dict[ForwardedConnection, None] = {}
+        self._connections: dict[Http2Connection, None] = {}
         self._shares: dict[str, str] = {}  # names of shares by gRPC's name of the peer
 
     @property
@@ -76,7 +66,7 @@ class Http2Front:
         """Forward a connection on its own threads. If there are too many connections that are not
         clients, end the oldest of them.
         """
-        connection = ForwardedConnection(self, client)
+        connection = Http2Connection(self, client)
         with self._lock:
             strangers = []
             for earlier in self._connections:
@@ -100,7 +90,7 @@ class Http2Front:
         with self._lock:
             self._shares[peer] = share
 
-    def remove(self, connection: ForwardedConnection) -> None:
+    def remove(self, connection: Http2Connection) -> None:
         """Remove a connection that has ended."""
         with self._lock:
             del self._connections[connection]
@@ -128,7 +118,7 @@ class Http2Front:
         self._folder.cleanup()
 
 
-class ForwardedConnection:
+class Http2Connection(ForwardedConnection):
     """One connection of a client, and its connection to gRPC's server.
 
     Args:
@@ -137,113 +127,41 @@ class ForwardedConnection:
     """
 
     def __init__(self, front: Http2Front, client: socket.socket) -> None:
+        super().__init__(front.name, client)
         self._front = front
-        self._client = client
-        self._server = socket.socket(socket.AF_UNIX)
-        # The kernel chooses a unique name for the connection, by which gRPC's server identifies the
-        # peer.
-        self._server.bind("")
         self.peer = f"unix-abstract:{self._server.getsockname()[1:].decode()}"
         self._frames = FrameCounter()
         self._allowed_frames = TokenBucket(_FRAMES_PER_S, time.monotonic(), _FRAMES_AT_ONCE)
-        self._ended = threading.Event()
-        self.thread = threading.Thread(target=self._run, name=f"{front.name}-requests", daemon=True)
-        self._answers = threading.Thread(
-            target=self._forward_answers, name=f"{front.name}-answers", daemon=True
-        )
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the connection is still open."""
-        return not self._ended.is_set()
-
-    def end(self) -> None:
-        """End both connections immediately; may be called on any thread."""
-        self._ended.set()
-        shut_down(self._client)
-        shut_down(self._server)
-
-    def wait_answered(self, deadline: float) -> None:
-        """Wait until the client has received the last answers of a gRPC server that has stopped.
-
-        Args:
-            deadline: The time until which this method waits, s, of `time.monotonic()`.
-        """
-        if self._answers.is_alive():
-            self._answers.join(max(0.0, deadline - time.monotonic()))
-
-    def _run(self) -> None:
-        """Forward the connection until it ends; runs on its own thread."""
-        try:
-            self._read_preface()
-            self._front.set_share(self.peer, share_of(self._client))
-            self._server.connect(self._front.path)
-            self._server.sendall(PREFACE)
-            self._answers.start()
-            self._forward_requests()
-        except (MalformedMessage, OSError) as error:
-            logger.info("%s: disconnected a client: %s", self._front.name, error)
-        finally:
-            self.end()
-            if self._answers.ident is not None:
-                self._answers.join()
-            self._front.remove(self)
-            self._client.close()
-            self._server.close()
-
-    def _read_preface(self) -> None:
+    def greet(self) -> tuple[str, bytes]:
         """Read the preface of HTTP/2; raise `MalformedMessage` for other bytes."""
         deadline = time.monotonic() + _HANDSHAKE_S
         preface = b""
         while preface != PREFACE:
-            self._client.settimeout(max(0.001, deadline - time.monotonic()))
-            received = self._client.recv(len(PREFACE) - len(preface))
+            received = self.read(len(PREFACE) - len(preface), deadline)
             preface += received
             if not received or not PREFACE.startswith(preface):
                 raise MalformedMessage(
                     "expected the preface of HTTP/2, got another one; use a client of gRPC"
                 )
+        self._front.set_share(self.peer, share_of(self._client))
+        return self._front.path, PREFACE
 
-        self._client.settimeout(None)
-        self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        send_limit = struct.pack("ll", int(_SEND_S), 0)
-        self._client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, send_limit)
-        set_keep_alive(self._client)
+    def admit(self, data: bytes) -> bool:
+        """Wait until the client's frames are within the allowed rate."""
+        frames = self._frames.count(data)
+        if frames > _FRAMES_AT_ONCE:
+            self._ended.wait(_UNREAD_S)
+            raise MalformedMessage(
+                f"expected at most {_FRAMES_AT_ONCE} small frames at once, got {frames}"
+            )
 
-    def _forward_requests(self) -> None:
-        """Forward the client's bytes to gRPC's server, at the allowed rate of frames."""
-        while True:
-            data = self._client.recv(_READ_BYTES)
-            if not data:
-                return
-
-            frames = self._frames.count(data)
-            if frames > _FRAMES_AT_ONCE:
-                self._ended.wait(_UNREAD_S)
-                raise MalformedMessage(
-                    f"expected at most {_FRAMES_AT_ONCE} small frames at once, got {frames}"
-                )
-
+        wait_s = self._allowed_frames.take(time.monotonic(), frames)
+        while wait_s > 0:
+            if self._ended.wait(wait_s):
+                return False
             wait_s = self._allowed_frames.take(time.monotonic(), frames)
-            while wait_s > 0:
-                if self._ended.wait(wait_s):
-                    return
-                wait_s = self._allowed_frames.take(time.monotonic(), frames)
+        return True
 
-            # After the end of gRPC's server, its last answers are still forwarded.
-            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-                self._server.sendall(data)
-
-    def _forward_answers(self) -> None:
-        """Forward the bytes of gRPC's server to the client; runs on its own thread."""
-        try:
-            data = self._server.recv(_READ_BYTES)
-            while data:
-                self._client.sendall(data)
-                data = self._server.recv(_READ_BYTES)
-        except OSError as error:
-            # A server that ends with unread requests resets the connection after its answers.
-            logger.info("%s: disconnected a client: %s", self._front.name, error)
-        finally:
-            wait_delivered(self._client, time.monotonic() + ANSWERS_S)
-            self.end()
+    def closed(self) -> None:
+        self._front.remove(self)

@@ -11,24 +11,32 @@ The keys of a deployment D, an instance I and a session S:
     …/D/instances/I/sessions/S/language/request                 rejected: no policy answers text
     …/D/instances/I/sessions/S/alive                            liveliness of the robot
 
-Zenoh's messages have no field for an API key. If the network is open to anyone but trusted robots,
-connect both the server and the robots to a Zenoh router, which has TLS and access rules.
+Zenoh's messages have no field for an API key, and do not name their sender. Each connection to the
+port is therefore a Zenoh network without other clients: a client cannot subscribe to, publish to or
+query the keys of another. Zenoh's own access rules would apply to all clients alike, and a rule for
+`sessions/*/act` also admits a client that subscribes to that expression itself.
+
+If the network is open to anyone but trusted robots, connect both the server and the robots to a
+Zenoh router, which has TLS and access rules. Its robots share one network, in which the router's
+rules have to keep them apart.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import logging
 import math
-import queue
 import socket
+import tempfile
 import threading
 import time
 import uuid
-from collections import OrderedDict
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,6 +47,8 @@ from pydantic import BaseModel, Field
 from vlagents_ray.errors import (
     ConfigError,
     MalformedMessage,
+    MessageTooLarge,
+    Overloaded,
     PolicyFailed,
     PolicyUnavailable,
     VLAgentsError,
@@ -47,11 +57,15 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import DELAY, LEFTOVER
 from vlagents_ray.registry import require
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.access.charges import Account, Charge
 from vlagents_ray.serve.config.dialects import KeylessPortConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
-from vlagents_ray.serve.engine.admission import MessageAdmission
-from vlagents_ray.serve.ports import LOOPBACK
+from vlagents_ray.serve.engine.admission import ArrivingBytes, MessageAdmission
+from vlagents_ray.serve.token_bucket import TokenBucket
 from vlagents_ray.wire.mapping import KeyMapping
+from vlagents_ray_dialects.acceptor import TICK_S, Acceptor
+from vlagents_ray_dialects.client_reader import share_of
+from vlagents_ray_dialects.forwarding import SHORT_FOLDER, ForwardedConnection
 from vlagents_ray_dialects.gateway_sessions import GatewayClient, GatewayClients, internal_error
 from vlagents_ray_dialects.messages import lerobot_remote as messages
 from vlagents_ray_dialects.messages.lerobot_remote import (
@@ -66,9 +80,20 @@ from vlagents_ray_dialects.messages.lerobot_remote import (
 logger = logging.getLogger(__name__)
 
 _PREFIX = f"lerobot/inference/v{messages.PROTOCOL_VERSION}/deployments"
-_WAITING = 8  # maximum number of waiting messages of a robot; further messages are dropped
-_OPENINGS = 32  # number of openings whose answers are repeated for a repeated query
-_CHECK_S = 0.5  # the period of the check for robots that have disconnected
+# Maximum number of observations of a robot that wait, of which the oldest is dropped, and of its
+# control messages, of which further ones are rejected.
+_WAITING, _WAITING_CONTROLS = 8, 32
+# Maximum number of questions of a connection that wait for an answer, and of sessions that it opens
+# in a second and at once. LeRobot's client sends one question after the other, and opens one
+# session. Opening a session takes about 10 ms.
+_QUESTIONS, _OPENS_PER_S, _OPENS_AT_ONCE = 8, 5.0, 10
+_ANSWERING = 2  # number of threads that answer questions
+_CONTROL_BYTES = 256 * 1024  # maximum size of a message that is no observation
+_HANDSHAKE_S = 5.0  # maximum time until the first bytes of a client
+_STRANGERS = 64  # maximum number of connections without a session; one more ends the oldest
+# Bytes of Zenoh's protocol around a message, which has its key, and around each KiB of a message.
+_OVERHEAD_BYTES, _OVERHEAD_SHARE = 1024, 1024
+_NO_ROOM_S = 10.0  # time after which a connection ends if there is no memory for its bytes
 _END_S = 3.0  # the time limit for the end of a robot's thread
 # LeRobot's names for the modes in which a robot executes chunks: one chunk after another, or
 # real-time chunking with a policy that is either guided to the plan or trained to begin with the
@@ -154,136 +179,424 @@ class LeRobotRemoteDialect(PortDialect):
         super().__init__(name, config, context)
         self.offer = Offer(config, context)
         self.offer.require_fit(self.mapping)
-        self._robots: GatewayClients[str, RobotSession] = GatewayClients(context)
-        # The answer to each query, by the query's id.
-        self._openings: OrderedDict[str, bytes] = OrderedDict()
-        self._opening = threading.Lock()
-        self._zenoh: Any = None
-        self._declared: list[Any] = []
-        self._checks: threading.Thread | None = None
+        self.robots: GatewayClients[str, RobotSession] = GatewayClients(context)
+        self.questions = ThreadPoolExecutor(_ANSWERING, f"{name}-questions")
         self._closing = threading.Event()
+        # Either the clients of the port, or the network of the router.
+        self._acceptor: Acceptor | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._numbers = itertools.count()
+        self._lock = threading.Lock()  # guards the next field
+        self._connections: dict[RobotConnection, None] = {}  # the oldest first
+        self._router: RobotNetwork | None = None
+        self._checks: threading.Thread | None = None
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether no more sessions are opened, since the server is stopping."""
+        return self._closing.is_set()
 
     def serve(self, listener: socket.socket) -> None:
-        """Open Zenoh's session, which listens at the port or is a client of the router."""
-        zenoh = require("zenoh")
-        host = self.config.host or LOOPBACK
-        listener.close()  # Zenoh binds the port itself
-        settings: dict[str, Any] = {
-            "mode": "peer" if self.config.router is None else "client",
-            "connect/endpoints": [] if self.config.router is None else [self.config.router],
-            "listen/endpoints": [f"tcp/{host}:{self.config.port}"],
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": False,
-            "transport/shared_memory/enabled": False,
-        }
-        if self.config.router is not None:
-            settings["listen/endpoints"] = []
-        path = self.config.zenoh_config
-        config = zenoh.Config() if path is None else zenoh.Config.from_file(str(path))
-        for setting, value in settings.items():
-            config.insert_json5(setting, json.dumps(value))
-        self._zenoh = zenoh.open(config)
-
-        key = self.offer.instance_key
-        declare = self._zenoh.declare_queryable
-        self._declared = [
-            declare(f"{self.offer.key}/describe", self._direct(self._describe), complete=True),
-            declare(f"{key}/open", self._direct(self._open), complete=True),
-            self._zenoh.liveliness().declare_token(f"{key}/alive"),
-        ]
+        """Accept the connections of the port, or connect to the router."""
+        require("zenoh")
+        if self.config.router is None:
+            self._folder = tempfile.TemporaryDirectory(prefix="vlr-", dir=SHORT_FOLDER)
+            self._acceptor = Acceptor(self.name, listener, self._add, self.robots.forget_quiet)
+            return
+        listener.close()
+        self._router = RobotNetwork(self, {"mode": "client", "connect": [self.config.router]})
         self._checks = threading.Thread(target=self._check, name=self.name, daemon=True)
         self._checks.start()
 
     def alive(self) -> bool:
+        if self._acceptor is not None:
+            return self._acceptor.alive()
         return self._checks is not None and self._checks.is_alive()
 
     def close(self) -> None:
         """Begin no more sessions, end all of them after their current actions, and disconnect."""
         self._closing.set()
-        for robot in self._robots.end_all():
+        if self._acceptor is not None:
+            self._acceptor.close()
+        for robot in self.robots.end_all():
             robot.join()
+        self.questions.shutdown(wait=False, cancel_futures=True)
         if self._checks is not None:
             self._checks.join()
-        if self._zenoh is not None:
-            self._zenoh.close()
+        if self._router is not None:
+            self._router.close()
 
-    @staticmethod
-    def _direct(function: Callable[[Any], None]) -> Any:
-        """Return a handler that Zenoh calls on its own thread, without a queue."""
-        return require("zenoh").handlers.Callback(function, indirect=False)
+        with self._lock:
+            connections = list(self._connections)
+        for connection in connections:
+            connection.disconnect()
+        deadline = time.monotonic() + _END_S
+        for connection in connections:
+            connection.wait_answered(deadline)
+            connection.end()
+        for connection in connections:
+            connection.thread.join(max(0.0, deadline - time.monotonic()))
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def new_path(self) -> str:
+        """Return a new path for the socket of a connection's network."""
+        if self._folder is None:
+            raise TypeError("a connection without a port: call serve() first")
+        return f"{self._folder.name}/{next(self._numbers)}"
+
+    def remove(self, connection: RobotConnection) -> None:
+        """Remove a connection that has ended."""
+        with self._lock:
+            self._connections.pop(connection, None)
+
+    def _add(self, client: socket.socket) -> None:
+        """Forward a connection. If too many connections have no session, end the oldest of
+        them.
+        """
+        connection = RobotConnection(self, client)
+        with self._lock:
+            strangers = [
+                earlier
+                for earlier in self._connections
+                if earlier.is_open and not earlier.has_session
+            ]
+            self._connections[connection] = None
+        if len(strangers) >= _STRANGERS:
+            strangers[0].end()
+        connection.thread.start()
 
     def _check(self) -> None:
         """End the sessions of disconnected robots, until the dialect is closed."""
-        while not self._closing.wait(_CHECK_S):
-            self._robots.forget_quiet()
+        while not self._closing.wait(TICK_S):
+            self.robots.forget_quiet()
 
-    def _describe(self, query: Any) -> None:
-        """Answer a query with the descriptor of the deployment."""
-        request = self._read(query)
-        if request is not None:
-            answer = Envelope(
-                "descriptor",
-                self.offer.instance_id,
-                request_id=request.request_id,
-                body=self.offer.descriptor(),
+
+class RobotConnection(ForwardedConnection):
+    """One connection to the port, which is a Zenoh network without other clients.
+
+    Args:
+        dialect: The dialect.
+        client: The connection.
+    """
+
+    def __init__(self, dialect: LeRobotRemoteDialect, client: socket.socket) -> None:
+        super().__init__(dialect.name, client)
+        self._dialect = dialect
+        self._share = share_of(client)  # the name of the client's share of the bytes in flight
+        self._network: RobotNetwork | None = None
+        is_robot = dialect.config.priority == "robot"
+        self._counting = threading.Lock()  # guards the two following values
+        self._incomplete = 0  # bytes that arrived and belong to no message that Zenoh has delivered
+        # Zenoh joins the fragments of one reliable message and of one other message at a time.
+        self._most_incomplete = 2 * _most_bytes(dialect.context)
+        self._arriving = ArrivingBytes(dialect.context.admission, self._share, is_robot, self.end)
+
+    @property
+    def has_session(self) -> bool:
+        """Whether the client has a session."""
+        return self._network is not None and self._network.has_session
+
+    def greet(self) -> tuple[str, bytes]:
+        """Read the beginning of Zenoh's handshake, and open the client's network."""
+        deadline = time.monotonic() + _HANDSHAKE_S
+        head = b""
+        while len(head) < messages.HEAD_BYTES:
+            received = self.read(messages.HEAD_BYTES - len(head), deadline)
+            if not received:
+                raise ConnectionResetError("the client disconnected")
+            head += received
+        messages.check_head(head)
+
+        path = self._dialect.new_path()
+        settings = {"mode": "peer", "listen": [f"unixsock-stream/{path}"]}
+        self._network = RobotNetwork(self._dialect, settings, self)
+        return path, head
+
+    def admit(self, data: bytes) -> bool:
+        """Count bytes as in flight until Zenoh delivers the message to which they belong. Without
+        room for them, the client's oldest observation is dropped, or the client has to wait.
+        """
+        with self._counting:
+            self._incomplete = min(self._incomplete + len(data), self._most_incomplete)
+            is_small = self._incomplete <= 2 * _CONTROL_BYTES
+        if not is_small and not self.has_session:
+            raise MessageTooLarge(
+                f"expected at most {2 * _CONTROL_BYTES} bytes before a session is opened"
             )
-            _reply(query, messages.encode(answer))
+        deadline = time.monotonic() + _NO_ROOM_S
+        while True:
+            try:
+                with self._counting:
+                    self._arriving.resize(self._incomplete)
+            except Overloaded:
+                if self._network is not None and self._network.drop_observation():
+                    continue
+                if time.monotonic() > deadline:
+                    raise
+                if self._ended.wait(0.01):
+                    return False
+            else:
+                return self.is_open
 
-    def _open(self, query: Any) -> None:
-        """Begin a session on a separate thread, since declaring its keys must not block Zenoh's
-        thread.
+    def delivered(self, size: int) -> None:
+        """Stop counting the bytes of a message of `size` bytes, which Zenoh has delivered."""
+        with self._counting:
+            size += _OVERHEAD_BYTES + size // _OVERHEAD_SHARE
+            self._incomplete = max(0, self._incomplete - size)
+            with contextlib.suppress(Overloaded):  # the number has become smaller
+                self._arriving.resize(self._incomplete)
+
+    @property
+    def share(self) -> str:
+        """The name of the client's share of the bytes in flight."""
+        return self._share
+
+    def disconnect(self) -> None:
+        """Leave the client's network, so that the client learns that the server stops."""
+        if self._network is not None:
+            self._network.close()
+
+    def closed(self) -> None:
+        """End the session of the client."""
+        self.disconnect()
+        with self._counting:
+            self._incomplete = 0
+            self._arriving.release()
+        self._dialect.remove(self)
+
+
+class RobotNetwork:
+    """A Zenoh network, and the sessions of its robots: one robot for each connection to the port,
+    and all robots that use the same router.
+
+    Args:
+        dialect: The dialect.
+        settings: The mode and the endpoints of Zenoh's session.
+        connection: The connection to the port; None for a router.
+    """
+
+    def __init__(
+        self,
+        dialect: LeRobotRemoteDialect,
+        settings: Mapping[str, Any],
+        connection: RobotConnection | None = None,
+    ) -> None:
+        self.dialect = dialect
+        self.connection = connection
+        self._account = Account(NoKey.OPEN)
+        self._lock = threading.Lock()  # guards the following values
+        self._robots: dict[str, RobotSession] = {}
+        self._waiting = 0  # number of questions without an answer
+        self._is_closed = False
+        robots = 1 if connection is not None else dialect.context.sessions
+        self._most_waiting = _QUESTIONS * robots
+        self._openings = TokenBucket(
+            _OPENS_PER_S * robots, time.monotonic(), _OPENS_AT_ONCE * robots
+        )
+        self.zenoh = self._connect(settings)
+
+        offer = dialect.offer
+        self._declared = [
+            self._answer_at(f"{offer.key}/describe", self._describe),
+            self._answer_at(f"{offer.instance_key}/open", self._open),
+            self.zenoh.liveliness().declare_token(f"{offer.instance_key}/alive"),
+        ]
+
+    @property
+    def has_session(self) -> bool:
+        """Whether a robot has a session."""
+        return bool(self._robots)
+
+    def close(self) -> None:
+        """End the sessions after their current actions, and disconnect."""
+        with self._lock:
+            is_closed, self._is_closed = self._is_closed, True
+            robots = list(self._robots)
+        if is_closed:
+            return
+        for session_id in robots:
+            self._end(session_id)
+        self.zenoh.close()
+
+    def admission(self, charge: Charge, share: str) -> MessageAdmission:
+        """Return the admission of a message that has arrived; `share` is the name of a robot's
+        share of the bytes in flight if its address is not known.
         """
-        request = self._read(query)
-        if request is not None:
-            threading.Thread(
-                target=self._begin, args=(query, request), name=f"{self.name}-open", daemon=True
-            ).start()
+        context = self.dialect.context
+        return MessageAdmission(
+            context.admission,
+            context.limits,
+            charge,
+            robot=self.dialect.config.priority == "robot",
+            inline=False,
+            share=share if self.connection is None else self.connection.share,
+        )
 
-    def _read(self, query: Any) -> Envelope | None:
-        """Return the message in a query; None if the message was unreadable, in which case the
-        query has been answered with an error.
+    def payload_of(self, message: Any, key: str, limit: int, *, is_query: bool) -> Any:
+        """Return the payload of a message that has arrived; None if it has none.
+
+        Args:
+            message: The query or the sample.
+            key: The key at which the server answers or receives the message.
+            limit: Maximum number of bytes.
+            is_query: Whether the message is a query.
+
+        Raises:
+            MalformedMessage: The message is for several keys, or has a part that no client of
+                LeRobot sends.
+            MessageTooLarge: The message is too large.
         """
-        data = b"" if query.payload is None else query.payload.to_bytes()
-        try:
-            return messages.decode(data, self.context.limits)
-        except VLAgentsError as error:
-            answer = Envelope("error", body=messages.error_body(error))
-            _reply(query, messages.encode(answer))
-            return None
+        payload = message.payload
+        size = 0 if payload is None else len(payload)
+        if self.connection is not None:
+            self.connection.delivered(size)
+        if str(message.key_expr) != key:
+            raise MalformedMessage("key: expected the key of one server or session, got wildcards")
+        if message.attachment is not None or (is_query and str(message.parameters)):
+            raise MalformedMessage(
+                "message: expected a payload alone, got an attachment or parameters"
+            )
+        if size > limit:
+            raise MessageTooLarge(f"message: expected at most {limit} bytes, got {size}")
+        return payload
 
-    def _begin(self, query: Any, request: Envelope) -> None:
-        """Begin the session that a client requests, and answer with its id."""
-        with self._opening:
-            answer = self._openings.get(request.request_id)
-            if answer is None:
-                answer = messages.encode(self._accepted(request))
-                self._openings[request.request_id] = answer
-                while len(self._openings) > _OPENINGS:
-                    self._openings.popitem(last=False)
-        _reply(query, answer)
+    def drop_observation(self) -> bool:
+        """Drop the oldest observation of a robot that waits; return False if there is none."""
+        with self._lock:
+            robots = list(self._robots.values())
+        return any(robot.drop_observation() for robot in robots)
 
-    def _accepted(self, request: Envelope) -> Envelope:
-        """Return the answer to a request for a session."""
+    def forget(self, session_id: str) -> None:
+        """Forget a session that has ended."""
+        with self._lock:
+            self._robots.pop(session_id, None)
+        self.dialect.robots.remove(session_id)
+
+    def _end(self, session_id: str) -> None:
+        """End a session after its current action."""
+        with self._lock:
+            robot = self._robots.pop(session_id, None)
+        self.dialect.robots.remove(session_id)
+        if robot is not None:
+            robot.end()
+
+    def _connect(self, settings: Mapping[str, Any]) -> Any:
+        """Open Zenoh's session."""
+        zenoh = require("zenoh")
+        path = self.dialect.config.zenoh_config
+        config = zenoh.Config() if path is None else zenoh.Config.from_file(str(path))
+        all_settings: dict[str, Any] = {
+            "mode": settings["mode"],
+            "connect/endpoints": settings.get("connect", []),
+            "listen/endpoints": settings.get("listen", []),
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+            "transport/shared_memory/enabled": False,
+            # Zenoh joins the fragments of a message before it delivers the message. Messages of
+            # other priorities would be joined at the same time.
+            "transport/unicast/qos/enabled": False,
+            "transport/link/rx/max_message_size": _most_bytes(self.dialect.context),
+        }
+        for setting, value in all_settings.items():
+            config.insert_json5(setting, json.dumps(value))
+        return zenoh.open(config)
+
+    def _answer_at(self, key: str, answer: Callable[[Envelope], Envelope]) -> Any:
+        """Answer the questions at a key."""
+        arrive = partial(self._arrive, key, answer)
+        return self.zenoh.declare_queryable(key, direct(arrive), complete=True)
+
+    def _arrive(self, key: str, answer: Callable[[Envelope], Envelope], query: Any) -> None:
+        """Let a thread answer a question, since this is Zenoh's thread."""
+        admission = self.admission(self._account.charge(), "questions")
         try:
-            if self._closing.is_set():
-                raise StaleMessage("open: the server is stopping; connect again")
-            if request.instance_id != self.offer.instance_id:
-                raise StaleMessage(
-                    f"instance_id: expected {self.offer.instance_id!r}, got "
-                    f"{request.instance_id!r}; the server was started again: connect again"
-                )
-            terms = self.offer.accept(request.body)
-            session_id = uuid.uuid4().hex
-            make = partial(RobotSession, self, session_id, self._zenoh, terms)
-            robot = self._robots.add(session_id, make)
-            robot.declare(lambda: self._robots.remove(session_id))
+            payload = self.payload_of(query, key, _CONTROL_BYTES, is_query=True)
+            with self._lock:
+                is_opening = answer == self._open
+                is_fast = is_opening and self._openings.take(time.monotonic()) > 0
+                if is_fast or self._waiting >= self._most_waiting:
+                    raise Overloaded("too many questions at once; ask again in a second")
+                admission.receive(0 if payload is None else len(payload))
+                self._waiting += 1
+            data = b"" if payload is None else payload.to_bytes()
+            self.dialect.questions.submit(self._answer, key, answer, query, data, admission)
         except VLAgentsError as error:
-            return request.reply("error", messages.error_body(error))
+            admission.release()
+            reply(query, key, Envelope("error", body=messages.error_body(error)))
+        except RuntimeError:  # the dialect has been closed
+            admission.release()
+            query.drop()
+
+    def _answer(
+        self,
+        key: str,
+        answer: Callable[[Envelope], Envelope],
+        query: Any,
+        data: bytes,
+        admission: MessageAdmission,
+    ) -> None:
+        """Answer a question."""
+        request = Envelope("error")
+        try:
+            admission.begin_message()
+            request = messages.decode(data, self.dialect.context.limits)
+            response = answer(request)
+        except VLAgentsError as error:
+            response = request.reply("error", messages.error_body(error))
         except Exception:  # noqa: BLE001 - logged, and answered
-            internal = VLAgentsError(internal_error(self.name))
-            return request.reply("error", messages.error_body(internal))
-        body = {**self.offer.descriptor(), **terms}
-        return Envelope("accepted", self.offer.instance_id, session_id, 0, request.request_id, body)
+            internal = VLAgentsError(internal_error(self.dialect.name))
+            response = request.reply("error", messages.error_body(internal))
+        finally:
+            admission.release()
+            with self._lock:
+                self._waiting -= 1
+        reply(query, key, response)
+
+    def _describe(self, request: Envelope) -> Envelope:
+        """Return the descriptor of the deployment."""
+        offer = self.dialect.offer
+        return Envelope(
+            "descriptor",
+            offer.instance_id,
+            request_id=request.request_id,
+            body=offer.descriptor(),
+        )
+
+    def _open(self, request: Envelope) -> Envelope:
+        """Begin the session that a client requests, and return the answer with its id.
+
+        A client that asks again gets a new session. The earlier session of its connection ends.
+        """
+        dialect = self.dialect
+        if dialect.is_stopping:
+            raise StaleMessage("open: the server is stopping; connect again")
+        if not request.request_id:
+            raise MalformedMessage("request_id: expected an id of the request, got none")
+        if request.instance_id != dialect.offer.instance_id:
+            raise StaleMessage(
+                "instance_id: expected the id in the server's description, got another one; the "
+                "server was started again: connect again"
+            )
+        terms = dialect.offer.accept(request.body)
+        if self.connection is not None:
+            for earlier in list(self._robots):
+                self._end(earlier)
+
+        session_id = uuid.uuid4().hex
+        robot = dialect.robots.add(session_id, partial(RobotSession, self, session_id, terms))
+        with self._lock:
+            is_closed = self._is_closed
+            if not is_closed:
+                self._robots[session_id] = robot
+        if is_closed:
+            dialect.robots.remove(session_id)
+            raise StaleMessage("open: the client has disconnected")
+        robot.declare()
+        body = {**dialect.offer.descriptor(), **terms}
+        return Envelope(
+            "accepted", dialect.offer.instance_id, session_id, 0, request.request_id, body
+        )
 
 
 class Offer:
@@ -427,7 +740,7 @@ class Offer:
             ("action_feature", capabilities["action_feature"]),
             ("semantics", self._config.semantics),
         ):
-            if body.get(name) != expected:
+            if not messages.equals(body.get(name), expected):
                 raise IncompatibleRequest(
                     f"{name}: expected {shown(expected, 400)}, got {shown(body.get(name), 400)}"
                 )
@@ -439,25 +752,27 @@ class Offer:
                 f"action_interval: expected {self._interval_s:g} s, got {shown(interval)}"
             )
         mode, encoding = body.get("mode"), body.get("encoding")
-        if mode not in self.modes:
+        if not isinstance(mode, str) or mode not in self.modes:
             raise UnsupportedRequest(
                 f"mode: expected one of {self.modes}, which the policy can, got {shown(mode)}"
             )
-        if encoding not in ("raw", "jpeg"):
+        if not isinstance(encoding, str) or encoding not in ("raw", "jpeg"):
             raise UnsupportedRequest(f"encoding: expected raw or jpeg, got {shown(encoding)}")
         return {"mode": mode, **self._merging(body)}
 
     def _merging(self, body: Mapping[str, Any]) -> dict[str, Any]:
         """Return the accepted settings for merging chunks in a request for a session."""
         required = body.get("required_capabilities", [])
-        if not isinstance(required, list) or not set(map(str, required)) <= set(MERGES):
+        if not isinstance(required, list) or not all(
+            isinstance(name, str) and name in MERGES for name in required
+        ):
             raise UnsupportedRequest(
                 f"required_capabilities: expected only {list(MERGES)}, got {shown(required)}"
             )
         settings = body.get("chunk_settings", {})
         if not isinstance(settings, dict):
             raise MalformedMessage(f"chunk_settings: expected a map, got {shown(settings)}")
-        is_aligned = settings.get("chunk_merge") == "aligned"
+        is_aligned = messages.equals(settings.get("chunk_merge"), "aligned")
         if is_aligned != bool(required):
             raise IncompatibleRequest(
                 "chunk_settings: expected chunk_merge 'aligned' together with its name in "
@@ -471,29 +786,41 @@ class Offer:
         return {"chunk_settings": settings} if settings else {}
 
 
+@dataclass(eq=False, slots=True)
+class _Arrived:
+    """A message of a robot that waits for its answer.
+
+    Attributes:
+        kind: `control`, `obs` or `language`.
+        data: The message.
+        admission: Counts the message as in flight until it is answered or dropped.
+        query: Zenoh's query, which a control message is.
+    """
+
+    kind: str
+    data: bytes
+    admission: MessageAdmission
+    query: Any
+
+
 class RobotSession(GatewayClient):
     """One robot, whose messages are answered in their order on a separate thread.
 
     Args:
-        dialect: The dialect.
+        network: The network of the robot.
         session_id: The id of the session in the protocol.
-        session: Zenoh's session.
         terms: The settings of the session, as `Offer.accept` returns them.
     """
 
-    def __init__(
-        self,
-        dialect: LeRobotRemoteDialect,
-        session_id: str,
-        session: Any,
-        terms: Mapping[str, Any],
-    ) -> None:
+    def __init__(self, network: RobotNetwork, session_id: str, terms: Mapping[str, Any]) -> None:
+        dialect = network.dialect
         super().__init__(dialect.context)
         # The protocol has no key, which the deployment has accepted.
         self.sessions.show(NoKey.OPEN, None)
+        self._network = network
         self._dialect = dialect
         self._session_id = session_id
-        self._zenoh = session
+        self._zenoh = network.zenoh
         self._mode: str = terms["mode"]
         self._is_aligned = terms.get("chunk_settings", {}).get("chunk_merge") == "aligned"
         self._key = f"{dialect.offer.instance_key}/sessions/{session_id}"
@@ -503,37 +830,41 @@ class RobotSession(GatewayClient):
         # Whether the robot's liveliness token is present; None if this is not known yet.
         self._is_present: bool | None = None
         self._absent_since = time.monotonic()
-        self._inbox: queue.Queue[tuple[str, Any] | None] = queue.Queue(_WAITING)
+        self._inbox: deque[_Arrived] = deque()
+        self._changed = threading.Condition()  # guards the inbox
         self._declared: list[Any] = []
-        self._forget: Callable[[], None] = lambda: None
         self._ended = threading.Event()
         self._sending = threading.Lock()  # guards the two following values
         self._asked: Envelope | None = None  # the observation that is being answered
         self._is_silent = False  # whether no more answers are sent
         self._thread = threading.Thread(target=self._run, name=f"{dialect.name}-robot", daemon=True)
 
-    def declare(self, forget: Callable[[], None]) -> None:
-        """Declare the keys of the session, and begin to answer.
-
-        Args:
-            forget: Removes the session from the dialect; called when the client has closed it.
-        """
-        self._forget = forget
-        direct = self._dialect._direct
+    def declare(self) -> None:
+        """Declare the keys of the session, and begin to answer."""
         session = self._zenoh
-        self._declared = [
-            session.declare_queryable(
-                f"{self._key}/control", direct(partial(self._arrive, "control")), complete=True
-            ),
-            session.declare_subscriber(f"{self._key}/obs", direct(partial(self._arrive, "obs"))),
-            session.declare_subscriber(
-                f"{self._key}/language/request", direct(partial(self._arrive, "language"))
-            ),
-            session.liveliness().declare_subscriber(
-                f"{self._key}/alive", direct(self._see), history=True
-            ),
-        ]
-        self._thread.start()
+        arrive = {
+            suffix: direct(partial(self._arrive, kind, f"{self._key}/{suffix}"))
+            for suffix, kind in (
+                ("control", "control"),
+                ("obs", "obs"),
+                ("language/request", "language"),
+            )
+        }
+        try:
+            self._declared.append(
+                session.declare_queryable(
+                    f"{self._key}/control", arrive.pop("control"), complete=True
+                )
+            )
+            for suffix, handler in arrive.items():
+                self._declared.append(session.declare_subscriber(f"{self._key}/{suffix}", handler))
+            self._declared.append(
+                session.liveliness().declare_subscriber(
+                    f"{self._key}/alive", direct(self._see), history=True
+                )
+            )
+        finally:
+            self._thread.start()  # it also undoes the declarations
 
     def quiet_s(self, now: float) -> float:
         """Return the time for which the robot has been disconnected, s; a connected robot may be
@@ -544,8 +875,8 @@ class RobotSession(GatewayClient):
     def end(self) -> None:
         """End the session after the current action."""
         self._ended.set()
-        with contextlib.suppress(queue.Full):  # the thread checks `_ended` after each message
-            self._inbox.put_nowait(None)
+        with self._changed:
+            self._changed.notify_all()
 
     def join(self) -> None:
         """Wait until the session has ended; if an action takes too long, send an error to the
@@ -566,57 +897,125 @@ class RobotSession(GatewayClient):
         self._is_present = sample.kind == zenoh.SampleKind.PUT
         self._absent_since = time.monotonic()
 
-    def _arrive(self, kind: str, message: Any) -> None:
-        """Queue a message on Zenoh's thread; if the queue is full, drop it, as Zenoh does under
-        load.
+    def _arrive(self, kind: str, key: str, message: Any) -> None:
+        """Keep a message until the robot's thread answers it; called on Zenoh's thread.
+
+        If there is no room, the oldest observation is dropped, as Zenoh does under load. A control
+        message is never dropped, but may be answered with an error.
         """
+        is_control = kind == "control"
+        admission = self._network.admission(self.sessions.account.charge(), self._session_id)
         try:
-            self._inbox.put_nowait((kind, message))
-        except queue.Full:
-            logger.warning("lerobot_remote: a robot sends faster than it is answered")
+            limit = self._context.limits.body_bytes if kind == "obs" else _CONTROL_BYTES
+            payload = self._network.payload_of(message, key, limit, is_query=is_control)
+            with self._changed:
+                self._make_room(kind)
+                self._receive(admission, 0 if payload is None else len(payload))
+                data = b"" if payload is None else payload.to_bytes()
+                query = message if is_control else None
+                self._inbox.append(_Arrived(kind, data, admission, query))
+                self._changed.notify_all()
+        except VLAgentsError as error:
+            admission.release()
+            if is_control:
+                reply(message, key, Envelope("error", body=messages.error_body(error)))
+            else:
+                logger.info("lerobot_remote: dropped a message of a robot: %s", error)
+
+    def _make_room(self, kind: str) -> None:
+        """Make room for one more message in the inbox; the caller holds the lock.
+
+        Raises:
+            Overloaded: Too many control messages wait.
+        """
+        if self._ended.is_set():
+            raise StaleMessage("session: expected an open session, got one that has ended")
+        is_control = kind == "control"
+        waiting = [item for item in self._inbox if (item.kind == "control") == is_control]
+        if is_control and len(waiting) >= _WAITING_CONTROLS:
+            raise Overloaded("too many control messages wait; send one after the other")
+        if not is_control and len(waiting) >= _WAITING:
+            self._drop(waiting[0])
+
+    def _receive(self, admission: MessageAdmission, size: int) -> None:
+        """Count a message as in flight; drop the oldest observations if there is no room for it.
+
+        Raises:
+            Overloaded: No observation is left, and there is still no room.
+        """
+        while True:
+            try:
+                admission.receive(size)
+            except Overloaded:
+                if not self.drop_observation():
+                    raise
+            else:
+                return
+
+    def drop_observation(self) -> bool:
+        """Drop the oldest observation that waits; return False if there is none."""
+        with self._changed:
+            for item in self._inbox:
+                if item.kind != "control":
+                    self._drop(item)
+                    return True
+        return False
+
+    def _drop(self, item: _Arrived) -> None:
+        """Drop a message that waits; the caller holds the lock."""
+        self._inbox.remove(item)
+        item.admission.release()
+        logger.info("lerobot_remote: a robot sends faster than it is answered")
 
     def _run(self) -> None:
         """Answer the messages of the robot until its session ends."""
         try:
-            while not self._ended.is_set():
-                item = self._inbox.get()
-                if item is None:
-                    break
-                kind, message = item
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._ended.is_set() or bool(self._inbox))
+                    if self._ended.is_set():
+                        break
+                    item = self._inbox.popleft()
                 self._unanswered += 1
                 try:
-                    self._answer(kind, message)
+                    self._answer(item)
                 finally:
                     self._unanswered -= 1
                     self._used = time.monotonic()
         except Exception:
             logger.exception("lerobot_remote: a session failed")
         finally:
-            self._forget()
-            for declared in self._declared:
-                declared.undeclare()
+            self._ended.set()
+            self._network.forget(self._session_id)
+            self._refuse_waiting()
+            # The client may have disconnected, which has ended the declarations.
+            with contextlib.suppress(require("zenoh").ZError):
+                for declared in self._declared:
+                    declared.undeclare()
             self.sessions.close()
 
-    def _answer(self, kind: str, message: Any) -> None:
-        """Answer one message: a query, or a sample of an observation."""
-        payload = b"" if message.payload is None else message.payload.to_bytes()
+    def _refuse_waiting(self) -> None:
+        """Answer the control messages that still wait with an error, and drop all others."""
+        with self._changed:
+            waiting = list(self._inbox)
+            self._inbox.clear()
+        ended = StaleMessage("session: expected an open session, got one that has ended")
+        for item in waiting:
+            item.admission.release()
+            if item.query is not None:
+                answer = Envelope("error", body=messages.error_body(ended))
+                reply(item.query, f"{self._key}/control", answer)
+
+    def _answer(self, item: _Arrived) -> None:
+        """Answer one message."""
         handle = {"control": self._control, "obs": self._act, "language": self._refuse_language}
         request: Envelope | None = None
-        charge = self.sessions.account.charge()
-        admission = MessageAdmission(
-            self._context.admission,
-            self._context.limits,
-            charge,
-            robot=self._dialect.config.priority == "robot",
-            inline=False,
-            share=self._session_id,
-        )
+        admission = item.admission
         try:
-            admission.receive(len(payload))
             admission.begin_message()
-            request = messages.decode(payload, self._context.limits)
+            request = messages.decode(item.data, self._context.limits)
             self._require_current(request)
-            answer = handle[kind](request, admission)
+            answer = handle[item.kind](request, admission)
         except VLAgentsError as error:
             answer = (request or Envelope("error")).reply("error", messages.error_body(error))
         except Exception:  # noqa: BLE001 - logged, and answered
@@ -625,35 +1024,40 @@ class RobotSession(GatewayClient):
         finally:
             admission.release()
 
-        data = messages.encode(answer)
-        if kind == "control":
-            _reply(message, data)
+        if item.query is not None:
+            reply(item.query, f"{self._key}/control", answer)
             return
         with self._sending:
             self._asked = None
             if not self._is_silent:
-                self._put("act" if kind == "obs" else "language/result", data)
+                suffix = "act" if item.kind == "obs" else "language/result"
+                self._put(suffix, messages.encode(answer))
 
     def _put(self, suffix: str, data: bytes) -> None:
         """Publish a message at a key of the session."""
         zenoh = require("zenoh")
-        self._zenoh.put(
-            f"{self._key}/{suffix}", data, congestion_control=zenoh.CongestionControl.DROP
-        )
+        with contextlib.suppress(zenoh.ZError):  # the client has disconnected
+            self._zenoh.put(
+                f"{self._key}/{suffix}", data, congestion_control=zenoh.CongestionControl.DROP
+            )
 
     def _require_current(self, request: Envelope) -> None:
-        """Raise `StaleMessage` if a message belongs to another instance or session."""
+        """Raise `StaleMessage` if a message belongs to another instance or session.
+
+        The error contains no id, since an id is what a client of the session knows.
+        """
         expected = self._dialect.offer.instance_id, self._session_id
         if (request.instance_id, request.session_id) != expected:
             raise StaleMessage(
-                f"instance and session: expected {expected}, got "
-                f"{(request.instance_id, request.session_id)}; open a session again"
+                "instance and session: expected those in the message's key, got others; open a "
+                "session again"
             )
 
     def _control(self, request: Envelope, _admission: MessageAdmission) -> Envelope:
         """Reset, invalidate or close the session."""
         operation = request.body.get("operation")
-        if operation not in ("reset", "invalidate", "close", "status"):
+        operations = ("reset", "invalidate", "close", "status")
+        if not isinstance(operation, str) or operation not in operations:
             raise MalformedMessage(
                 "operation: expected reset, invalidate, close or status, got "
                 f"{shown(operation, 40)}"
@@ -695,7 +1099,7 @@ class RobotSession(GatewayClient):
             raise StaleMessage(
                 f"sequence: expected more than {self._last_sequence}, got {shown(sequence)}"
             )
-        if body.get("artifact_identity") != self._dialect.offer.artifact:
+        if not messages.equals(body.get("artifact_identity"), self._dialect.offer.artifact):
             raise IncompatibleRequest(
                 f"artifact_identity: expected {self._dialect.offer.artifact!r}, got "
                 f"{shown(body.get('artifact_identity'))}"
@@ -796,10 +1200,28 @@ class RobotSession(GatewayClient):
         raise UnsupportedRequest("language: this deployment answers with actions only")
 
 
-def _reply(query: Any, data: bytes) -> None:
-    """Answer a query, and end it; until the end, the client waits for further replies."""
-    query.reply(str(query.key_expr), data)
-    query.drop()
+def _most_bytes(context: GatewayContext) -> int:
+    """Return the number of bytes of the largest message, with the bytes around it."""
+    return context.limits.body_bytes + _OVERHEAD_BYTES
+
+
+def direct(function: Callable[[Any], None]) -> Any:
+    """Return a handler that Zenoh calls on its own thread, without a queue."""
+    return require("zenoh").handlers.Callback(function, indirect=False)
+
+
+def reply(query: Any, key: str, answer: Envelope) -> None:
+    """Answer a query at a key, and end it; until the end, the client waits for further replies.
+
+    The answer to a query with wildcards does not contain the key.
+    """
+    data = messages.encode(answer)
+    with contextlib.suppress(require("zenoh").ZError):  # the client has disconnected
+        if str(query.key_expr) == key:
+            query.reply(key, data)
+        else:
+            query.reply_err(data)
+        query.drop()
 
 
 def _continuation(body: Mapping[str, Any], name: str, offer: Offer) -> np.ndarray | None:

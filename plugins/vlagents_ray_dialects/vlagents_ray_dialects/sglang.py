@@ -119,8 +119,8 @@ class SGLangDialect(base.HttpDialect):
             request: The request.
             message: The message that contains the request.
             sender: The sender of the message.
-            own: The session of a single observation without a session name; None if such an
-                observation gets a session for this request only.
+            own: The session of a connection, which a single observation without a session name
+                uses; None if such an observation gets a session for this request only.
             name: The id of the request.
         """
         if message.charge is not None:
@@ -152,9 +152,13 @@ class SGLangDialect(base.HttpDialect):
     ) -> list[base.ImplicitSession]:
         """Return the session of each observation of a request."""
         if request.session_names:
+            names = request.session_names
+            if own is not None:
+                # Sessions end with their connection, so another connection means another session.
+                names = [f"{own.id}/{name}" for name in names]
             # All names are searched for at once: each search takes a tenth of a second.
             searches = []
-            for name, begins in zip(request.session_names, request.begins_episode, strict=True):
+            for name, begins in zip(names, request.begins_episode, strict=True):
                 searches.append(self.client_session(sender, name, begins=begins))
             return await asyncio.gather(*searches)
         if own is not None and not request.is_batch:

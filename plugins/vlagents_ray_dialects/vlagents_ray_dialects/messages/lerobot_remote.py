@@ -59,6 +59,7 @@ _ENVELOPE = (
     "request_id",
     "body",
 )
+HEAD_BYTES, _INIT = 3, 0x01
 _SEGMENT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}\Z")
 _RECORD = "__lerobot_type__"
 _INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
@@ -94,6 +95,35 @@ def is_segment(text: object) -> bool:
     return isinstance(text, str) and _SEGMENT.match(text) is not None
 
 
+def equals(value: object, expected: object) -> bool:
+    """Return whether a value of a client equals a plain value, also if the client sends an array in
+    its place.
+    """
+    if isinstance(expected, dict):
+        return (
+            isinstance(value, dict)
+            and value.keys() == expected.keys()
+            and all(equals(value[name], item) for name, item in expected.items())
+        )
+    if isinstance(expected, list):
+        return (
+            isinstance(value, list)
+            and len(value) == len(expected)
+            and all(map(equals, value, expected))
+        )
+    return type(value) is type(expected) and value == expected
+
+
+def check_head(head: bytes) -> None:
+    """Raise `MalformedMessage` unless a connection begins with `HEAD_BYTES` bytes of Zenoh's
+    protocol: the size of a batch, and the header of the first message of a handshake.
+    """
+    if head[2] & 0x3F != _INIT:
+        raise MalformedMessage(
+            "expected the handshake of Zenoh, got other bytes; use LeRobot's remote inference"
+        )
+
+
 def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> Envelope:
     """Decode a message.
 
@@ -111,7 +141,7 @@ def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> Envelope:
     raw = unpack(data, limits, _record)
     if not isinstance(raw, dict) or not raw.keys() >= set(_ENVELOPE):
         raise MalformedMessage(f"message: expected a map with {list(_ENVELOPE)}, got {shown(raw)}")
-    if raw["version"] is True or raw["version"] != PROTOCOL_VERSION:
+    if not equals(raw["version"], PROTOCOL_VERSION):
         raise MalformedMessage(
             f"version: expected {PROTOCOL_VERSION}, got {shown(raw['version'], 20)}"
         )
@@ -126,7 +156,7 @@ def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> Envelope:
         raise MalformedMessage(f"generation: expected a whole number, got {shown(generation)}")
     for name in ("instance_id", "session_id", "request_id"):
         is_needed = kind in _OF_A_SESSION
-        if not is_segment(raw[name]) and (is_needed or raw[name] != ""):
+        if not is_segment(raw[name]) and (is_needed or not equals(raw[name], "")):
             raise MalformedMessage(
                 f"{name}: expected 1 to 128 letters, digits, '_', '.' and '-', got "
                 f"{shown(raw[name])}"
