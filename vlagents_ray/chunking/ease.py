@@ -5,28 +5,36 @@ increasing speed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from vlagents_ray.columns import Columns
 
 _ROUNDING = 1e-9
+# A policy at 90 % of the limits of speed needs five ramps to catch up. A policy beyond the limits
+# never does; its next row is then checked at full speed, and rejected.
+_RAMPS, _LEAST_TICKS = 10, 50
+# Speed, acceleration and jerk are differences of up to three rows.
+_FULL_ROWS = 3
 
 
 class EaseIn:
     """Computes commands that lead from a pose at rest onto the path of a plan.
 
-    The rows are executed later, never faster. For `approach` ticks, the command moves straight to
-    the first row along the minimum-jerk quintic polynomial (Flash & Hogan 1985), at rest at both
-    ends. Then the speed along the rows increases from zero to full speed within `ramp` ticks. Half
-    as many rows are executed in these ticks, so the ramp ends exactly at a row. The ramp begins at
-    rest, at the first row. If it began earlier, a robot that is already at the first row would
-    reach the second row at an arbitrary speed. If too few rows are known, for example with short
-    chunks, the ramp has a section for each chunk, which ends exactly at the chunk's last row. Each
-    section begins with the final speed of the previous section. If a section cannot reach full
-    speed, it ends with a speed at which the next section, with the same number of rows, need not
-    brake.
+    For `approach` ticks, the command moves straight to the first row along the minimum-jerk quintic
+    polynomial (Flash & Hogan 1985), at rest at both ends. Then the speed along the rows increases
+    from zero to full speed within `ramp` ticks. Half as many rows are executed in these ticks, so
+    the ramp ends exactly at a row. The ramp begins at rest, at the first row. If it began earlier,
+    a robot that is already at the first row would reach the second row at an arbitrary speed. In
+    the approach and the ramp, rows are executed later, never faster.
+
+    If too few rows are known for a ramp, as with single actions or short chunks, the command
+    catches up with the plan instead: at each tick it moves as far towards the newest row as the
+    limits allow (`largest_share`), so that its speed rises from tick to tick. Targets advance by a
+    row at each tick, as the policy expects them to. Motions are divided, and a row of motions ends
+    when all of it was executed. The ease-in is over as soon as three rows in a row were executed at
+    full speed: from then on, speed, acceleration and jerk depend on the policy alone.
 
     Args:
         columns: The meaning of the columns: targets are approached, and motions are divided.
@@ -34,6 +42,8 @@ class EaseIn:
         approach: The number of ticks until the first row: at least 1 if the row has only targets, 0
             if it may begin at once.
         ramp: The number of ticks until full speed, an even number.
+        largest_share: Returns the largest share of the way from the last command, (D,), to a row,
+            (D,), that the limits allow at this tick, in [0, 1]; also gets the row before, (D,).
         at_once: The columns of grippers without limits. Their commands are the unchanged values of
             the rows.
     """
@@ -44,21 +54,30 @@ class EaseIn:
         start: np.ndarray,
         approach: int,
         ramp: int,
+        largest_share: Callable[[np.ndarray, np.ndarray, np.ndarray], float],
         *,
         at_once: Sequence[int] = (),
     ) -> None:
         self._columns = columns
         self._from = start
         self._approach, self._ramp = approach, ramp
+        self._largest_share = largest_share
         self._at_once = list(at_once)
         # A row of motions is a motion, so the ramp begins before the row.
         self._is_motion = bool(columns.relative)
+        self._counts_shares = len(columns.absolute) == len(columns.grippers)
         self._tick = -approach  # tick of the ramp, negative during the approach
         self._speed = 0.0 if ramp else 1.0  # rows per tick
         self._rise = 0.0  # increase of the speed per tick
         self._position = 0.0  # the position on the plan, in rows since the beginning of the section
         self._rows = 0  # the number of rows of the section
         self._ticks = 0  # number of ticks that are left in the section
+        self._latest_tick = 0  # the tick at which catching up ends at the latest
+        self._newest: np.ndarray | None = None  # the newest row while catching up, (D,)
+        self._row_share = 0.0  # the share of a row of motions that was executed while catching up
+        self._full_rows = 0  # consecutive rows at full speed while catching up
+        self.catches_up = False
+        """Whether the command catches up with a plan of too few rows for a ramp."""
 
     @property
     def arrived(self) -> bool:
@@ -68,22 +87,17 @@ class EaseIn:
     @property
     def over(self) -> bool:
         """Whether full speed is reached."""
+        if self.catches_up:
+            return self._full_rows == _FULL_ROWS or self._tick > self._latest_tick
         return self.arrived and self._ticks == 0 and self._is_full(self._speed)
 
-    @property
-    def may_end(self) -> bool:
-        """Whether the next row may be tried at full speed.
-
-        This is true between two sections, once the time of a whole ramp has passed.
-        """
-        return self._ticks == 0 and self._tick >= self._ramp
-
     def step(
-        self, action: np.ndarray, after: np.ndarray | None, known: int
+        self, last: np.ndarray, action: np.ndarray, after: np.ndarray | None, known: int
     ) -> tuple[np.ndarray, int]:
         """Return the command of a tick, and the number of rows that it completes.
 
         Args:
+            last: The last command, (D,).
             action: The next row of the plan, (D,).
             after: The row after `action`, (D,); None if there is none.
             known: The number of rows from `action` to the end of the plan.
@@ -101,8 +115,11 @@ class EaseIn:
             self._from = action
             return command, 0 if self._is_motion else 1
 
-        if not self._ticks:
+        if not self._ticks and not self.catches_up:
             self._begin_section(known)
+        if self.catches_up:
+            return self._catch_up(last, action)
+
         before, self._position = self._position, self._next_position()
         row = int(self._position)
         share = self._position - row
@@ -119,20 +136,41 @@ class EaseIn:
         return self._columns.joined(command, self._part(after, 0.0, share)), 1
 
     def _begin_section(self, known: int) -> None:
-        """Begin a section of the ramp, which ends at full speed or at the last known row."""
+        """Begin a section of the ramp, which ends at full speed; if too few rows are known for it,
+        begin to catch up.
+        """
         self._position = 0.0
         first = math.ceil((1.0 - self._speed**2) * self._ramp / 2)
         for rows in range(max(1, first), known + 1):
             ticks = math.ceil(2 * rows / (1.0 + self._speed))
-            rise = self._rise_of(rows, ticks)
+            rise = 2 * (rows - ticks * self._speed) / ticks**2
             if 0.0 <= rise * self._ramp <= 1.0 + _ROUNDING and self._is_full(
                 self._speed + ticks * rise
             ):
                 self._rows, self._ticks, self._rise = rows, ticks, rise
                 return
+        self.catches_up = True
+        self._latest_tick = self._tick + max(_LEAST_TICKS, _RAMPS * self._ramp)
 
-        self._rows, self._ticks = known, self._ticks_until_end(known)
-        self._rise = self._rise_of(self._rows, self._ticks)
+    def _catch_up(self, last: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, int]:
+        """Return the command as far towards a row as the limits allow, and the number of rows that
+        it completes.
+        """
+        start = last.copy()
+        start[self._at_once] = action[self._at_once]
+        before = self._columns.still(action) if self._newest is None else self._newest
+        share = self._largest_share(start, action, before)
+        command = self._columns.travel(start, action, 0.0, share)
+        self._newest = action
+        self._full_rows = self._full_rows + 1 if share == 1.0 else 0
+        if not self._counts_shares:
+            return command, 1
+
+        self._row_share += share
+        if self._row_share < 1.0:
+            return command, 0
+        self._row_share -= 1.0
+        return command, 1
 
     def _next_position(self) -> float:
         """Return the position after this tick, during which the speed increases evenly."""
@@ -140,28 +178,6 @@ class EaseIn:
         position = self._position + self._speed + self._rise / 2
         self._speed += self._rise
         return float(self._rows) if self._ticks == 0 else position
-
-    def _ticks_until_end(self, rows: int) -> int:
-        """Return the number of ticks until the last known row.
-
-        The final speed is the largest one that the next section can keep.
-        """
-        ticks = 1
-        while ticks * self._speed + ticks**2 / (2 * self._ramp) < rows - _ROUNDING:
-            ticks += 1
-        while (ticks + 1) * self._speed <= rows:
-            speed = self._speed + ticks * self._rise_of(rows, ticks)
-            again = math.floor(rows / speed)
-            if speed <= 1.0 and again and rows - again * speed <= again**2 / (2 * self._ramp):
-                break
-            ticks += 1
-        return ticks
-
-    def _rise_of(self, rows: int, ticks: int) -> float:
-        """Return the increase of the speed per tick with which the rows are executed in this
-        number of ticks.
-        """
-        return 2 * (rows - ticks * self._speed) / ticks**2
 
     def _is_full(self, speed: float) -> bool:
         """Return whether a speed is at most one tick's increase below full speed."""

@@ -234,7 +234,7 @@ class Motion:
         """
         if self._ease is None or self._ease.over:
             return False
-        return not self._ease.arrived or plan.after is not None
+        return not self._ease.arrived or (not self._ease.catches_up and plan.after is not None)
 
     def tick(self) -> None:
         """Begin a tick, at which one action may be commanded."""
@@ -291,14 +291,10 @@ class Motion:
         ease = self._ease
         if ease is None or ease.over:
             return self.move(action, obs), 1
-        if ease.may_end:
-            # The chunks are too short to reach full speed, so full speed is used as soon as the
-            # check accepts it.
-            with contextlib.suppress(InvalidAction):
-                self._last, self._ease = self._checked(action, self._last), None
-                return self._last, 1
-
-        command, rows = ease.step(action, plan.after, plan.known)
+        last = self._last
+        if last is None:  # The rows have only motions.
+            last = Columns.from_spec(self._spec, len(action), self._arm).still(action)
+        command, rows = ease.step(last, action, plan.after, plan.known)
         self._last = self._checked(command, self._last)
         return self._last, rows
 

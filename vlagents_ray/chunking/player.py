@@ -243,6 +243,9 @@ class ChunkPlayer(Agent):
     timeliness: Timeliness
     """The share of the episode's ticks that had an action of the policy in time."""
 
+    rows: int
+    """The number of rows of the plan that were executed completely in the episode."""
+
     def __init__(
         self,
         agent: Agent,
@@ -287,6 +290,8 @@ class ChunkPlayer(Agent):
         self._replacements = deque[np.ndarray](maxlen=_MAX_REPLACEMENTS)
         self._is_replaced = False  # whether the policy's action of this tick was replaced
         self._chunks = 0  # the number of answers
+        self.rows = 0
+        self._ticks_of_rows = 0  # the number of ticks at which a row, or a part of it, was executed
         # The time at which the oldest unanswered request was sent, s of `time.monotonic`; None if
         # there is none.
         self._waiting_since: float | None = None
@@ -362,6 +367,13 @@ class ChunkPlayer(Agent):
             self._record_timing(answer)
         self._tick = 0
         return info
+
+    @property
+    def rows_per_tick(self) -> float | None:
+        """The number of rows of the plan per tick with a row in this episode: 1 at full speed, less
+        during an ease-in (`vlagents_ray.chunking.ease`); None without such a tick.
+        """
+        return self.rows / self._ticks_of_rows if self._ticks_of_rows else None
 
     def interrupt(self) -> None:
         """Drop the plan after the robot was stopped or moved, and did not execute the last action
@@ -662,6 +674,8 @@ class ChunkPlayer(Agent):
             else:
                 act = step.with_action(action, tick, self._silent_s())
                 act.info.update(timing)
+                self._ticks_of_rows += 1
+                self.rows += rows
                 if not rows:  # the command is still approaching the row
                     return replace(act, done=False)
                 self._plan.advance()

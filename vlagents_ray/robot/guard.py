@@ -25,6 +25,7 @@ _ROUNDING = 2.0**-23
 _FIRST_S = 0.5
 # The motion from rest to the first action takes this many times longer than its limits require.
 _SLOWNESS = 2.0
+_BISECTIONS = 16  # halvings of a way: a share is exact to 2e-5
 
 
 class Guard:
@@ -235,8 +236,58 @@ class Guard:
 
         self._check_steps(columns, numbers, last_numbers)
         if self.limits is not None:
-            self._check_dynamics(columns, numbers, last_numbers)
+            self._record(numbers, *self._check_dynamics(columns, numbers, last_numbers))
         return action
+
+    def _largest_share(self, last: np.ndarray, goal: np.ndarray, before: np.ndarray) -> float:
+        """Return the largest share of the way from the last command to a row that the limits of
+        steps and speeds allow at this tick.
+
+        Args:
+            last: The last command, (D,).
+            goal: The row, (D,).
+            before: The row before, (D,).
+
+        Returns:
+            The share, in [0, 1].
+
+        Raises:
+            InvalidAction: The plan itself is faster than the limits.
+        """
+        columns = self._columns_of(len(goal))
+        goal_numbers, last_numbers = goal.tolist(), last.tolist()
+        velocity_limits = self._limits_of(len(goal))[3]
+        # A plan continues at the row before, or begins again at the last command.
+        speeds = [columns.motion(goal_numbers, begin) for begin in (before.tolist(), last_numbers)]
+        for (i, speed), (_, other_speed) in zip(*map(self._sizes, speeds), strict=True):
+            limit = self._softness() * velocity_limits[i]
+            if min(speed, other_speed) > limit + 2 * _ROUNDING * abs(goal_numbers[i]):
+                raise self._refusal("velocity", i, speed, limit, 1)
+
+        if self._may_follow(columns, goal_numbers, last_numbers):
+            return 1.0
+
+        # No motion is braking, which is always allowed.
+        allowed, too_far = 0.0, 1.0
+        for _ in range(_BISECTIONS):
+            share = 0.5 * (allowed + too_far)
+            command = columns.travel(last, goal, 0.0, share)
+            if self._may_follow(columns, command.tolist(), last_numbers):
+                allowed = share
+            else:
+                too_far = share
+        return allowed
+
+    def _may_follow(
+        self, columns: Columns, numbers: list[float], last_numbers: list[float]
+    ) -> bool:
+        """Return whether the limits of steps and speeds allow an action after another."""
+        try:
+            self._check_steps(columns, numbers, last_numbers)
+            self._check_dynamics(columns, numbers, last_numbers)
+        except InvalidAction:
+            return False
+        return True
 
     def ease_in(
         self,
@@ -315,7 +366,7 @@ class Guard:
         if not columns.relative:
             ticks = max(1, ticks)
         even_ramp_ticks = 2 * math.ceil(ramp_ticks / 2)
-        return EaseIn(columns, start, ticks, even_ramp_ticks, at_once=at_once)
+        return EaseIn(columns, start, ticks, even_ramp_ticks, self._largest_share, at_once=at_once)
 
     def _check_first(
         self,
@@ -390,7 +441,7 @@ class Guard:
         ease = self.ease_in(last, rest_pose, far=True)
         yield last  # the motion begins at rest
         while ease is not None and not ease.arrived:
-            command, _ = ease.step(rest_pose, None, 1)
+            command, _ = ease.step(last, rest_pose, None, 1)
             yield command
 
     def _columns_of(self, dim: int) -> Columns:
@@ -535,13 +586,16 @@ class Guard:
 
     def _check_dynamics(
         self, columns: Columns, numbers: list[float], last_numbers: list[float]
-    ) -> None:
-        """Check the speed, acceleration and jerk of this tick's motion, and record it.
+    ) -> tuple[list[float], list[float]]:
+        """Check the speed, acceleration and jerk of this tick's motion.
 
         Args:
             columns: The meaning of the numbers.
             numbers: The numbers of the action.
             last_numbers: The numbers of the action or pose from which the motion begins.
+
+        Returns:
+            The speeds, and the changes of the speeds.
 
         Raises:
             InvalidAction: The motion exceeds a limit.
@@ -582,9 +636,13 @@ class Guard:
         for turn in self._turns:
             self._check_turn(turn, share, numbers, (last_speeds, speeds, changes, jerks))
 
+        return speeds, changes
+
+    def _record(self, numbers: list[float], speeds: list[float], changes: list[float]) -> None:
+        """Record the motion of an accepted action."""
         has_moved = any(speeds)
         # After a tick at rest, an earlier deceleration no longer counts.
-        self._changes = changes if has_moved else zeros
+        self._changes = changes if has_moved else [0.0] * len(numbers)
         self._accepted = numbers
         self._speeds = speeds
         self._ticks_with_motion += has_moved
