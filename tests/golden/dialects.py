@@ -67,7 +67,7 @@ def maps() -> Iterator[Trace]:
         infer(),
         infer(endpoint="jump"),
     )
-    at, on = ("/roboarena",), {"roboarena": mapped}
+    at, on = ("/roboarena",), {"roboarena": {**mapped, "action_space": "joint_position"}}
     yield from scenario("roboarena: episodes, and an error", at, first, named, gets(), dialects=on)
 
 

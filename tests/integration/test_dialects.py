@@ -25,7 +25,10 @@ CALLS = 12
 DIALECTS = {
     "openpi": {"mapping": "openpi-libero"},
     # The policy's rows have 7 numbers.
-    "roboarena": {"mapping": {"preset": "roboarena", "action_gripper": {"index": 6}}},
+    "roboarena": {
+        "mapping": {"preset": "roboarena", "action_gripper": {"index": 6}},
+        "action_space": "joint_position",
+    },
     "openvla": {},
     "vla_eval": {},
 }

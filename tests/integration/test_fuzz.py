@@ -85,7 +85,7 @@ FENCE = vla_eval_codec.encode(vla_eval_codec.VlaEvalMessage("hello", {"protocol_
 def server(shared_ray: None) -> Iterator[Server]:
     dialects = {
         "openpi": {"mapping": "openpi-libero"},
-        "roboarena": {"mapping": "openpi-libero"},
+        "roboarena": {"mapping": "openpi-libero", "action_space": "joint_position"},
         "openvla": {},
         "sglang": {},
         "vla_eval": {},

@@ -30,7 +30,7 @@ METADATA = {"policy": "mirror", "version": "0", "protocol": 1, "checkpoint": Non
 ALL: dict[str, Any] = {  # the dialects of the server's own port, with the settings that tests need
     **{name: {} for name in names("dialects") if issubclass(dialect_class(name), RouteDialect)},
     "openpi": {"mapping": "openpi-libero", "metadata": {"reset_pose": [0.5]}},
-    "roboarena": {"mapping": "openpi-libero"},
+    "roboarena": {"mapping": "openpi-libero", "action_space": "joint_position"},
     "vla_eval": {"observation_params": {"send_state": True}},
 }
 

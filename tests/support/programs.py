@@ -242,7 +242,7 @@ PROGRAMS = {
             "urllib3",
             "websockets",
         ),
-        dialects={"roboarena": {"mapping": "openpi-droid"}},
+        dialects={"roboarena": {"mapping": "openpi-droid", "action_space": "joint_position"}},
     ),
     "provael": Program(
         ("provael", "openpi-client"),

@@ -175,7 +175,7 @@ def test_clients_of_one_server_are_told_apart_and_nothing_is_left() -> None:
         peers.append(context.peer())
         return front.share_of(context.peer()).encode()
 
-    front = Http2Front("test", lambda _: True)
+    front = Http2Front("test", lambda _: True, lambda _: None)
     handler = grpc.unary_unary_rpc_method_handler(answer)
     server = grpc.server(
         ThreadPoolExecutor(2),
@@ -209,7 +209,7 @@ class StoppedServer:
 
     def __init__(self, stack: contextlib.ExitStack) -> None:
         self.client_peer = ""
-        front = Http2Front("test", self._is_client)
+        front = Http2Front("test", self._is_client, lambda _: None)
         server = stack.enter_context(socket.socket(socket.AF_UNIX))
         server.bind(front.path)
         server.listen()

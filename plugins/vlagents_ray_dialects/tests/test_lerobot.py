@@ -72,6 +72,19 @@ def test_each_client_has_a_session_and_gets_its_chunks(open_lerobot, replicas: R
         assert sessions(replicas) == 2
 
 
+def test_the_sessions_of_clients_that_disconnect_end_at_once(
+    open_lerobot, replicas: Replicas
+) -> None:
+    port = open_lerobot(idle_s=600.0)
+    with AsyncClient(port).begin() as silent:
+        assert rows(silent.act(robot_saw(0, pixel=1)))[0][4] == 1
+        for _ in range(12):  # more than the 8 sessions that the gateway may have
+            with AsyncClient(port).begin() as robot:
+                assert rows(robot.act(robot_saw(0, pixel=2)))[0][4] == 1
+        wait_for(lambda: sessions(replicas) == 1, timeout_s=5.0)
+        assert rows(silent.act(robot_saw(1, pixel=1)))[0][4] == 2
+
+
 def test_the_newest_observation_is_acted_on_and_a_time_step_once(open_lerobot) -> None:
     with AsyncClient(open_lerobot()).begin() as robot:
         robot.send(robot_saw(0, pixel=1))

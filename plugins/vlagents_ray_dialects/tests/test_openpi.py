@@ -5,6 +5,7 @@ and `reset`.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from served_agents import BatchedMirror, Mirror
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray_dialects.messages import openpi
 
@@ -197,7 +201,10 @@ def test_openpi_and_roboarena_share_the_root(context: tuple[TestClient, Engine])
 
 
 def test_an_old_roboarena_client_gets_the_array_itself() -> None:
-    with serving(Mirror(), {"roboarena": {"mapping": "openpi-libero", "bare": True}}) as (
+    with serving(
+        Mirror(),
+        {"roboarena": {"mapping": "openpi-libero", "bare": True, "action_space": "joint_position"}},
+    ) as (
         client,
         _,
     ):
@@ -232,3 +239,80 @@ def test_a_session_that_was_forgotten_begins_again(context: tuple[TestClient, En
         for session in engine.sessions.ids():
             engine.sessions.close(session)
         assert call(socket, libero(1))["actions"][0, 2] == 1
+
+
+# The first message of RoboArena's server
+
+DROID = Contract(
+    cameras={name: CameraSpec(180, 320) for name in ("front", "front_2")},
+    state={"joints": StateSpec(7)},
+    action=ActionSpec(dim=8, space="joint_velocity"),
+)
+ANNOUNCED: dict[str, tuple[Contract, dict[str, Any]]] = {
+    "the space": (DROID, {"action_space": "joint_velocity"}),
+    "another space": (
+        replace(DROID, action=ActionSpec(space="ee_pose")),
+        {"action_space": "cartesian_position"},
+    ),
+    "two cameras": (DROID, {"n_external_cameras": 2, "needs_wrist_camera": False}),
+    "a wrist camera": (
+        replace(DROID, cameras={"wrist": CameraSpec()}),
+        {"n_external_cameras": 0, "needs_wrist_camera": True},
+    ),
+    "sizes": (DROID, {"image_resolution": [180, 320]}),
+}
+
+
+@pytest.mark.parametrize(("contract", "expected"), ANNOUNCED.values(), ids=ANNOUNCED)
+def test_roboarena_is_told_what_the_contract_declares(
+    contract: Contract, expected: dict[str, Any]
+) -> None:
+    class Declared(Mirror):
+        pass
+
+    Declared.contract = contract
+    with serving(Declared(), {"roboarena": {}}) as (client, _):
+        DialectArgs(roboarena={}).require_fit(contract)  # type: ignore[arg-type]
+        with client.websocket_connect("/roboarena") as socket:
+            first = openpi.decode(socket.receive_bytes())
+    assert {name: first[name] for name in expected} == expected
+
+
+CONTRADICTIONS: dict[str, tuple[dict[str, Any], Contract | None, str]] = {
+    "a space": ({"action_space": "joint_position"}, DROID, "action_space: expected joint_velocity"),
+    "a size": ({"image_resolution": (224, 224)}, DROID, r"image_resolution: expected \[180, 320\]"),
+    "a wrist camera": ({"needs_wrist_camera": True}, DROID, "needs_wrist_camera: expected False"),
+    "a camera": ({"n_external_cameras": 1}, DROID, "n_external_cameras: expected 2"),
+    "no space": ({}, Contract(), "action_space: expected the meaning"),
+    "no contract": ({}, None, "action_space: expected the meaning"),
+    "relative joints": (
+        {"action_space": "joint_position"},
+        Contract(action=ActionSpec(space="joint", delta=True)),
+        "got relative actions of the space 'joint'",
+    ),
+    "another space": (
+        {},
+        Contract(action=ActionSpec(space="ee_position")),
+        "got absolute actions of the space 'ee_position'",
+    ),
+    "three cameras": (
+        {},
+        replace(DROID, cameras={name: CameraSpec() for name in ("a", "b", "c")}),
+        "cameras: expected up to two external cameras",
+    ),
+    "two sizes": (
+        {},
+        replace(DROID, cameras={"front": CameraSpec(180, 320), "wrist": CameraSpec(224, 224)}),
+        "image_resolution: expected one size",
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("settings", "contract", "expected"), CONTRADICTIONS.values(), ids=CONTRADICTIONS
+)
+def test_settings_of_roboarena_that_contradict_the_contract_are_refused(
+    settings: dict[str, Any], contract: Contract | None, expected: str
+) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        DialectArgs(roboarena=settings).require_fit(contract)  # type: ignore[arg-type]

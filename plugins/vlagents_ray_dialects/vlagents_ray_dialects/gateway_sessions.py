@@ -320,6 +320,13 @@ class GatewayClients(Generic[Key, Client]):
         with self._lock:
             self._clients.pop(key, None)
 
+    def end(self, key: Key) -> None:
+        """End the sessions of a client that has disconnected, and remove it."""
+        with self._lock:
+            client = self._clients.pop(key, None)
+        if client is not None:
+            client.end()
+
     def forget_quiet(self) -> None:
         """End the sessions of idle clients and of clients whose key is no longer valid."""
         with self._lock:

@@ -45,11 +45,15 @@ class Http2Front:
         name: The name of the dialect.
         is_client: Returns whether a peer is a client, given gRPC's name of the peer,
             `ServicerContext.peer()`.
+        forget: Called with gRPC's name of a peer whose connection has ended.
     """
 
-    def __init__(self, name: str, is_client: Callable[[str], bool]) -> None:
+    def __init__(
+        self, name: str, is_client: Callable[[str], bool], forget: Callable[[str], None]
+    ) -> None:
         self.name = name
         self._is_client = is_client
+        self._forget = forget
         self._folder = tempfile.TemporaryDirectory(prefix="vlr-", dir=SHORT_FOLDER)
         self.path = str(Path(self._folder.name, "grpc"))
         self._lock = threading.Lock()  # guards the next two fields
@@ -95,6 +99,7 @@ class Http2Front:
         with self._lock:
             del self._connections[connection]
             self._shares.pop(connection.peer, None)
+        self._forget(connection.peer)
 
     def close(self) -> None:
         """Forward the last answers to clients, end all connections, and remove the socket.

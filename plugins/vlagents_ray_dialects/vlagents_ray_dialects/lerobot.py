@@ -251,8 +251,8 @@ class LeRobotDialect(PortDialect):
     Config = LeRobotDialectConfig
     clients = "LeRobot"
     summary = (
-        "A session is the connection, until it is idle; an episode begins with `Ready` and with "
-        "each new task. The newest observation is acted on. Pickles are read as data: numbers, "
+        "A session is the connection, until it is idle or ends; an episode begins with `Ready` and "
+        "with each new task. The newest observation is acted on. Pickles are read as data: numbers, "
         "texts and numpy arrays."
     )
     scheme = "grpc"
@@ -300,7 +300,9 @@ class LeRobotDialect(PortDialect):
             maximum_concurrent_rpcs=max_requests,
         )
 
-        self._front = Http2Front(self.name, lambda peer: self._clients.get(peer) is not None)
+        self._front = Http2Front(
+            self.name, lambda peer: self._clients.get(peer) is not None, self._clients.end
+        )
         self._server.add_insecure_port(self._front.address)
         self._server.start()
         self._acceptor = Acceptor(self.name, listener, self._front.add, self._check_clients)

@@ -26,7 +26,9 @@ import numpy as np
 from pydantic import Field
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
+    ConfigError,
     MalformedMessage,
     TooManyRequests,
     VLAgentsError,
@@ -34,7 +36,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
 from vlagents_ray.serve.access.charges import Charge
-from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
+from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting, read_mapping
 from vlagents_ray.serve.dialects import base
 from vlagents_ray.serve.endpoints.http_messages import public_problem
 from vlagents_ray.serve.engine.admission import MessageAdmission
@@ -182,18 +184,22 @@ class OpenPiDialect(MapDialect):
 
 class RoboArenaDialectConfig(DialectConfig):
     """The settings of RoboArena's client. They are the fields of RoboArena's PolicyServerConfig,
-    and `bare`.
+    and `bare`. A field that the policy's contract declares must not contradict it.
     """
 
     mapping: MappingSetting = "roboarena"
     image_resolution: tuple[int, int] | None = Field(
-        default=(224, 224), description="height, width; null: any"
+        default=(224, 224), description="height, width; null: any; default: the contract's"
     )
     needs_wrist_camera: bool = Field(
-        default=True, description="whether the client sends the wrist camera"
+        default=True,
+        description="whether the client sends the wrist camera; default: the contract's",
     )
     n_external_cameras: int = Field(
-        default=1, ge=0, le=2, description="number of external cameras that the client sends"
+        default=1,
+        ge=0,
+        le=2,
+        description="number of external cameras that the client sends; default: the contract's",
     )
     needs_stereo_camera: bool = Field(
         default=False, description="whether the client sends both images of stereo cameras"
@@ -201,13 +207,98 @@ class RoboArenaDialectConfig(DialectConfig):
     needs_session_id: bool = Field(
         default=False, description="whether the client sends the name of its session"
     )
-    action_space: Literal[
-        "joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"
-    ] = Field(default="joint_position", description="meaning of the actions, for the client")
+    action_space: (
+        Literal["joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"]
+        | None
+    ) = Field(
+        default=None,
+        description="meaning of the actions, for the client; default: the contract's",
+    )
     bare: bool = Field(
         default=False,
         description="whether the answer is the array itself, as older clients need it",
     )
+
+
+# RoboArena's names of action spaces, by the contract's; positions are absolute.
+_ACTION_SPACES = {
+    "joint": "joint_position",
+    "joint_velocity": "joint_velocity",
+    "ee_pose": "cartesian_position",
+    "ee_velocity": "cartesian_velocity",
+}
+
+
+def _announcement(
+    config: RoboArenaDialectConfig, contract: Contract | None
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the first message to a client, and a sentence for each field of it that contradicts
+    the contract or is not known.
+    """
+    announced = config.model_dump(mode="json", exclude={"mapping", "priority", "bare"})
+    declared, faults = _declared(config, contract)
+    for name, value in declared.items():
+        if name in config.model_fields_set and announced[name] not in (value, None):
+            faults.append(
+                f"{name}: expected {value}, as the policy's contract declares, got "
+                f"{announced[name]}; leave the setting out"
+            )
+        announced[name] = value
+    if announced["action_space"] is None and not faults:
+        faults.append(
+            "action_space: expected the meaning of the actions, since the policy's contract does "
+            f"not declare it, got none; set it to one of {list(_ACTION_SPACES.values())}"
+        )
+    return announced, faults
+
+
+def _declared(
+    config: RoboArenaDialectConfig, contract: Contract | None
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the fields of the first message that the contract declares, and a sentence for each
+    property of the policy that the message cannot express.
+    """
+    declared: dict[str, Any] = {}
+    faults: list[str] = []
+    if contract is None:
+        return declared, faults
+
+    action = contract.action
+    if action.space is not None:
+        space = _ACTION_SPACES.get(action.space)
+        if space is None or (action.delta and "velocity" not in space):
+            kind = "relative" if action.delta else "absolute"
+            faults.append(
+                "action_space: expected an action that RoboArena's protocol has a name for, got "
+                f"{kind} actions of the space {action.space!r}; serve this policy to other clients"
+            )
+        else:
+            declared["action_space"] = space
+
+    if contract.cameras is not None:
+        mapping = config.keys() or read_mapping("roboarena")
+        keys = {name: camera.key for name, camera in mapping.cameras.items()}
+        wrist = [name for name in contract.cameras if "wrist" in keys.get(name, name)]
+        declared["needs_wrist_camera"] = bool(wrist)
+        external = len(contract.cameras) - len(wrist)
+        declared["n_external_cameras"] = external
+        if external > 2 or len(wrist) > 1:
+            faults.append(
+                "cameras: expected up to two external cameras and one wrist camera, which "
+                f"RoboArena's clients have, got {list(contract.cameras)}"
+            )
+        sizes = set()
+        for camera in contract.cameras.values():
+            if camera.height is not None and camera.width is not None:
+                sizes.add((camera.height, camera.width))
+        if len(sizes) == 1:
+            declared["image_resolution"] = list(sizes.pop())
+        elif sizes:
+            faults.append(
+                "image_resolution: expected one size for all cameras, which RoboArena's protocol "
+                f"announces, got {sorted(sizes)}"
+            )
+    return declared, faults
 
 
 class RoboArenaDialect(MapDialect):
@@ -223,8 +314,20 @@ class RoboArenaDialect(MapDialect):
     presets = openpi.ROBOARENA
     config: RoboArenaDialectConfig
 
+    @classmethod
+    def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:
+        """Return a sentence for each input that these clients never send, and for each field of the
+        first message that contradicts the contract or is not known.
+        """
+        if not isinstance(config, RoboArenaDialectConfig):
+            raise TypeError(f"config: expected RoboArena's settings, got {type(config).__name__}")
+        return super().lacks(config, contract) + _announcement(config, contract)[1]
+
     def first(self) -> dict[str, Any]:
-        return self.config.model_dump(mode="json", exclude={"mapping", "priority", "bare"})
+        announced, faults = _announcement(self.config, self.context.contract)
+        if faults:  # the contract became known when the policy was loaded
+            raise ConfigError("; ".join(faults))
+        return announced
 
     def speaks(self, message: dict[str, Any]) -> bool:
         return "endpoint" in message

@@ -15,6 +15,7 @@ from vlagents_ray.serve.in_time import RobotReport
 from vlagents_ray.serve.models.loaded_model import GpuWork
 from vlagents_ray.serve.replica import metrics
 from vlagents_ray.serve.replica.metrics import Exporter
+from vlagents_ray.serve.requests import Origin
 
 SERIES = 20  # number of metrics with values in a replica without a GPU, for any number of robots
 
@@ -86,6 +87,32 @@ def test_the_ticks_of_a_robot_that_is_always_in_time_are_exported(
 
     engine.stats.report("robot", RobotReport(0, 0, None))
     exporter.export()
+    engine.close()
+
+
+def test_the_sessions_of_all_transports_are_exported(monkeypatch: pytest.MonkeyPatch) -> None:
+    exported: dict[str, float] = {}
+
+    def series(_tags: object, _kind: object, name: str, *_: object, **__: object) -> Any:
+        def write(value: float = 1.0, tags: dict[str, str] | None = None) -> None:
+            if name == "sessions" and tags is not None:
+                exported[tags["transport"]] = value
+
+        return SimpleNamespace(set=write, inc=write, observe=write)
+
+    monkeypatch.setattr(metrics, "series", series)
+    engine = Engine(Noop.from_config({}), EngineSettings(threaded=False))
+    engine.start()
+    exporter = Exporter(engine, {})
+    for number, transport in enumerate(["sglang", "sglang", "xpolicylab", "shm", "of somebody"]):
+        engine.sessions.open(str(number), Origin(transport))
+        exporter.export()
+        assert sum(exported.values()) == len(engine.sessions) == number + 1
+    assert exported["sglang"] == 2
+    for number in range(5):
+        engine.sessions.close(str(number))
+        exporter.export()
+        assert sum(exported.values()) == len(engine.sessions)
     engine.close()
 
 

@@ -94,6 +94,8 @@ class Exporter:
         )
         self._depth = make(Gauge, "queue_depth", "Requests that wait.", "priority")
         self._sessions = make(Gauge, "sessions", "Sessions of the replica.", "transport")
+        # Also those that have no session any more, whose value is 0. A dialect is a transport.
+        self._transports = set(_TRANSPORTS)
         self._utilisation = make(Gauge, "utilisation", "Busy share of the policy's thread.")
         # These series of a GPU include the work of a policy in a child process. The values of the
         # tag `kind` are allocated, reserved and free.
@@ -158,7 +160,8 @@ class Exporter:
         for priority, depth in self._engine.queue.depth_by_priority().items():
             self._depth.set(depth, {"priority": priority.name.lower()})
         sessions = self._engine.sessions.by_transport()
-        for transport in _TRANSPORTS:
+        self._transports.update(sessions)
+        for transport in self._transports:
             self._sessions.set(sessions.get(transport, 0), {"transport": transport})
         self._utilisation.set(self._meter.read().utilisation)
         self._version.set(self._engine.weights.number)

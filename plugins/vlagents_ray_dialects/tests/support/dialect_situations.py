@@ -207,7 +207,7 @@ def _roboarena() -> Endpoint:
     return _websocket(
         "roboarena",
         "/roboarena",
-        {"mapping": "openpi-libero"},
+        {"mapping": "openpi-libero", "action_space": "joint_position"},
         reset=asks((websocket_frame(openpi.encode({"endpoint": "reset"})),)),
         acts=[infer(), infer(session_id="two")],
         wrong=infer(**{"observation/image": PIXELS[0]}),

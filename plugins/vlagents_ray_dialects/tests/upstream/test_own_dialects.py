@@ -23,7 +23,11 @@ from vlagents_ray_dialects.upstream import Upstream
 
 DIALECTS: dict[str, Any] = {
     "openpi": {"mapping": "openpi-libero"},
-    "roboarena": {"mapping": "openpi-libero", "n_external_cameras": 0},
+    "roboarena": {
+        "mapping": "openpi-libero",
+        "n_external_cameras": 0,
+        "action_space": "joint_position",
+    },
     "openvla": {"mapping": "openvla-oft", "chunk": True},
     "sglang": {},
     "vla_eval": {},
