@@ -252,8 +252,8 @@ class LeRobotDialect(PortDialect):
     clients = "LeRobot"
     summary = (
         "A session is the connection, until it is idle or ends; an episode begins with `Ready` and "
-        "with each new task. The newest observation is acted on. Pickles are read as data: numbers, "
-        "texts and numpy arrays."
+        "with each new task. The newest observation is acted on. Pickles are read as data: "
+        "numbers, texts and numpy arrays."
     )
     scheme = "grpc"
     requires = ("grpc",)
