@@ -33,6 +33,7 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import pip_install, require
 
 SUCCESS_KEYS = ("is_success", "success")
+_SAME_RATE = 0.001  # largest relative difference of two statements of one rate
 RENDER = "render"  # path that selects the image that the environment renders
 _PATH = re.compile(r"(?P<keys>[^\[\]]*?)(?:\[(?P<start>-?\d*):(?P<stop>-?\d*)\])?")
 
@@ -178,11 +179,6 @@ class Gymnasium(EvalEnv):
         self._ready = False
         self._steps = 0
         self._has_success = False  # whether a step of the episode has reported success or failure
-        if defaults.control_hz and control_hz not in (None, defaults.control_hz):
-            raise ConfigError(
-                f"{self._name}: control_hz: expected {defaults.control_hz:g}, the rate of its "
-                f"steps, got {control_hz:g}; leave it out"
-            )
         if success is not None:
             _require_whole(Pick.parse(success))
         self._env = self._make(max_steps)
@@ -216,12 +212,28 @@ class Gymnasium(EvalEnv):
                 )
 
             nested, _ = self._call("reset", seed=0)
-            self._contract = self._make_contract(
-                self._observe(nested), control_hz or defaults.control_hz
-            )
+            hz = self._control_hz(defaults.control_hz, control_hz)
+            self._contract = self._make_contract(self._observe(nested), hz)
         except BaseException:
             self.close()
             raise
+
+    def _control_hz(self, published: float | None, chosen: float | None) -> float | None:
+        """Return the rate of the steps, Hz: the published rate of the id, the rate of a simulation
+        in MuJoCo, or the option `control_hz`, which must not contradict the other two.
+        """
+        known = published
+        inner = self._env.unwrapped
+        if known is None and hasattr(inner, "frame_skip") and hasattr(inner, "dt"):
+            known = 1.0 / float(inner.dt)  # MujocoEnv: the duration of a step, s
+        if known is None or chosen is None:
+            return chosen or known
+        if abs(chosen / known - 1) > _SAME_RATE:
+            raise ConfigError(
+                f"{self._name}: control_hz: expected {known:g}, the rate of its steps, got "
+                f"{chosen:g}; leave it out"
+            )
+        return known
 
     def _step_limit(self, max_steps: int | None) -> int:
         """Return `max_steps` or, if it is None, the limit with which the id is registered."""

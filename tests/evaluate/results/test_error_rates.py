@@ -7,6 +7,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -303,6 +304,37 @@ def test_no_sequence_of_commands_decides_between_equal_policies_too_often(runs: 
     rng = np.random.default_rng(1)
     decided = sum(ever_decided(rng, looks=8) for _ in range(runs))
     assert decided / runs <= 0.05
+
+
+@cache
+def _fixed(only_a: int, only_b: int) -> float:
+    return mcnemar(only_a, only_b)
+
+
+@cache
+def _sequential(only_a: int, only_b: int) -> float:
+    return sequential_test([{Pairs(only_a=1): only_a, Pairs(only_b=1): only_b}])
+
+
+@pytest.mark.parametrize(("first", "step"), [(10, 10), (50, 10), (100, 100)])
+@pytest.mark.parametrize("rate", [0.1, 0.5])
+def test_a_first_look_and_growth_together_keep_the_error_rate(
+    first: int, step: int, rate: float
+) -> None:
+    """The worst sequence: a test of a fixed number of episodes, and then as many more as it takes,
+    up to ten times as many.
+    """
+    rng = np.random.default_rng(0)
+    runs, decided, unaware = 1000, 0, 0
+    for _ in range(runs):
+        a, b = rng.random((2, 10 * first)) < rate
+        only_a, only_b = np.cumsum(a & ~b).tolist(), np.cumsum(b & ~a).tolist()
+        looks = range(first - 1, 10 * first, step)
+        ps = [_fixed(only_a[looks[0]], only_b[looks[0]])]
+        ps += [_sequential(only_a[look], only_b[look]) for look in looks[1:]]
+        decided += min(ps) < 0.05
+        unaware += any(_fixed(only_a[look], only_b[look]) < 0.05 for look in looks)
+    assert decided / runs <= 0.05 < unaware / runs
 
 
 def test_a_number_that_was_chosen_before_the_first_result_is_fixed() -> None:
