@@ -7,15 +7,20 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from eval_fakes import OTHER_LINE
 from exported_results import SETTINGS, with_a_lost_episode
 
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.envs.base import EvalEnv
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate import EvalConfig, Results, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.exports import COLUMNS, rows, to_csv, to_json
+from vlagents_ray.interface import Act, Agent, Obs
 
 Config = Callable[..., EvalConfig]
 
@@ -62,3 +67,72 @@ def test_every_field_of_a_result_has_a_column() -> None:
 
 def test_a_part_of_the_results_is_exported_alone(results: Results, tmp_path: Path) -> None:
     assert to_json(results.only(env=OTHER_LINE), tmp_path / "a.json") == 2
+
+
+class Bare(EvalEnv):
+    """An environment that provides only what its interface requires."""
+
+    max_steps = 2
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(action=ActionSpec(dim=1))
+
+    @property
+    def instruction(self) -> str:
+        return ""
+
+    def reset(self, *, seed: int, options: Any = None) -> tuple[Obs, dict[str, Any]]:
+        self.count = 0
+        return Obs(), {}
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        self.count += 1
+        return Obs(), 0.5, False, self.count == 2, {"success": False}
+
+    def close(self) -> None:
+        pass
+
+
+class Plain(Agent):
+    """A policy that provides only what its interface requires."""
+
+    def reset(self, obs: Obs, instruction: str | None = None, **options: Any) -> dict[str, Any]:
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(1, np.float32))
+
+
+# The columns of an episode of `Bare` and `Plain` that are not null: each is measured here, follows
+# from the plan, or is required from every environment.
+PLANNED = {"key", "policy", "suite", "env", "episode", "seed", "settings", "run", "attempts"}
+MEASURED = {"seconds", "reset_ms", "env_step_ms", "env_seconds", "policy_ms", "policy_p95_ms"}
+MEASURED |= {"policy_seconds", "acts", "ticks_waited", "finished", "actions_sha256", "start"}
+REQUIRED = {"success_once", "success_at_end", "steps", "return", "ending"}
+EMPTY: tuple[Any, ...] = (None, "", {}, [], ())
+RECORDED = {"code", "status", "counted", "transport", "env_program", "policy_program"}
+
+
+def test_what_an_environment_or_a_policy_does_not_provide_is_null(tmp_path: Path) -> None:
+    config = EvalConfig.model_validate(
+        {
+            "policies": [{"name": "plain", "url": "http://x"}],
+            "suites": [{"envs": [f"{__name__}:Bare"], "episodes": 1}],
+            "out": tmp_path,
+            "workers": 0,
+        }
+    )
+    results = evaluate(config, agent_factory=Plain).results
+    [row] = rows(results)
+    present = {name for name, value in row.items() if value not in EMPTY}
+    assert present <= PLANNED | MEASURED | REQUIRED | RECORDED
+    assert (row["return"], row["success_once"], row["steps"]) == (1.0, False, 2)
+    assert row["ticks_waited"] == 0
+
+
+def test_a_lost_episode_has_no_measured_value(results: Results) -> None:
+    [lost] = [row for row in rows(results) if row["status"] == "infra_failed"]
+    present = {name for name, value in lost.items() if value not in EMPTY}
+    described = {"described", "code", "env_program", "policy_program"}
+    assert present <= PLANNED | described | {"status", "counted", "error", "finished"}

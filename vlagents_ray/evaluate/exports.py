@@ -30,10 +30,18 @@ class Column:
     value: Callable[[CaseResults, Episode], Any]
 
 
+# The fields that a lost episode has; nothing else was measured.
+_OF_LOST = {"full_key", "status", "error"}
+
+
 def _of_result(name: str, value_type: Type, meaning: str, field: str | None = None) -> Column:
-    return Column(
-        name, value_type, meaning, lambda _case, episode: getattr(episode.result, field or name)
-    )
+    field = field or name
+
+    def value(_case: CaseResults, episode: Episode) -> Any:
+        is_lost = episode.result.status == "infra_failed"
+        return None if is_lost and field not in _OF_LOST else getattr(episode.result, field)
+
+    return Column(name, value_type, meaning, value)
 
 
 def _of_case(name: str, value_type: Type, meaning: str) -> Column:
