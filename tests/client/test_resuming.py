@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import SimulatedTime
+from in_flight import pending
 from in_process_replicas import InProcess, Replicas
 
 from vlagents_ray import (
@@ -248,7 +249,8 @@ def test_a_session_that_did_not_begin_again_in_time_says_so_with_the_next_act(
             if executed:
                 call(self, requests, timeout_s)
             else:
-                served.engines[1].sessions.open(requests[0].session)
+                waiting = pending(requests[0].session, requests[0])
+                served.engines[1].sessions.reserve(waiting, {}, follows=True)
             raise DeadlineExceeded("no answer in time")
         return call(self, requests, timeout_s)
 

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from asgi_server import served
 from eval_fakes import wait_for
+from in_flight import opened
 from in_memory_keys import ChangingKeys
 from probes import bytes_probe, is_probe_answer
 from starlette.testclient import TestClient
@@ -491,7 +492,7 @@ def test_a_full_replica_closes_a_proxied_websocket_with_its_reason(
 ) -> None:
     token = keyed.known.add("arm")
     for number in range(8):
-        keyed.engine.sessions.open(f"lab/{number}")
+        opened(keyed.engine.sessions, f"lab/{number}")
     with connect(serving(keyed.engine, keyed.known.keys), additional_headers=shown(token)) as late:
         assert isinstance(decode_replies(late.recv(5))[0].error, PolicyUnavailable)
         with pytest.raises(ConnectionClosed) as closed:

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import collections
 import logging
+import math
 import threading
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from in_flight import opened, pending
 
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies import agent_copies
 from vlagents_ray.policies.agent_copies import AgentCopies
+from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve import sessions
 from vlagents_ray.serve.requests import Origin
-from vlagents_ray.serve.sessions import Outdated, Session, SessionTable
+from vlagents_ray.serve.sessions import Outdated, Past, Session, SessionTable
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
@@ -129,12 +132,12 @@ def test_a_huge_array_is_shared_but_cannot_be_written(monkeypatch: pytest.Monkey
 
 
 def test_a_full_table_refuses_and_makes_room_for_the_idle_which_are_forgotten() -> None:
-    table = SessionTable(limit=1, idle_s=60)
-    table.open("a")
+    table: SessionTable[Any] = SessionTable(limit=1, idle_s=60)
+    opened(table, "a")
     with pytest.raises(PolicyUnavailable, match="limit"):
-        table.open("b")
-    table.open("a").used -= 61
-    table.open("b").used -= 61
+        opened(table, "b")
+    opened(table, "a").used -= 61
+    opened(table, "b").used -= 61
     with pytest.raises(UnknownSession, match="'a'"):
         table.get("a")
     table.drop_idle()
@@ -187,12 +190,13 @@ def test_another_version_of_a_policy_has_another_fingerprint() -> None:
 
 
 def test_a_connection_ends_its_own_sessions_only() -> None:
-    table = SessionTable(limit=10, idle_s=60)
+    table: SessionTable[Any] = SessionTable(limit=10, idle_s=60)
+    left, right = Origin(owner="left"), Origin(owner="right")
     for name in ("a", "b"):
-        table.open(name, Origin(owner="left"))
-    table.open("b", Origin(owner="right"))  # its client returned over another connection
-    table.open("c")
-    table.close_owned("left", ["a", "b", "c", "d"])
+        opened(table, name, left)
+    opened(table, "b", right)  # its client returned over another connection
+    opened(table, "c")
+    table.close_owned(left)
     assert table.ids() == ["b", "c"]
 
 
@@ -202,9 +206,9 @@ def test_an_episode_begins_above_all_earlier_steps_of_its_session_though_the_clo
     table: SessionTable[object] = SessionTable(limit=10, idle_s=60, clock=lambda: 0)
     earlier = 2**40
     table.enter(Session("a", steps=earlier))  # from a replica whose clock is ahead
-    assert table.begin(table.get("a"), None, 0.0)[0] > earlier
+    assert opened(table, "a").first > earlier
     table.close("a")
-    assert table.begin(table.open("a"), None, 0.0)[0] > earlier
+    assert opened(table, "a").first > earlier
 
 
 Table = SessionTable[str]
@@ -219,12 +223,6 @@ def replace_by_newer(table: Table) -> None:
     table.enter(Session("a", steps=2**80))
 
 
-def cancel_first_reset(table: Table) -> None:
-    session = table.get("a")
-    session.steps = session.first = 0
-    table.undo("a", session.expected)
-
-
 def abandon_arriving(table: Table) -> None:
     arriving = table.get("a")
     table.release("a", arriving.version)
@@ -234,12 +232,11 @@ def abandon_arriving(table: Table) -> None:
 
 ENDS: dict[str, Callable[[Table], object]] = {
     "closed": lambda table: table.close("a"),
-    "closed with its connection": lambda table: table.close_owned("left", ["a"]),
+    "closed with its connection": lambda table: table.close_owned(table.get("a").origin),
     "idle": begin_idle,
     "released to another replica": lambda table: table.release("a", table.get("a").version),
-    "begun at another replica": lambda table: table.drop_older({"a": 2**80}),
+    "begun at another replica": lambda table: table.drop_older({"a": Past((2**80, 0), math.inf)}),
     "replaced by its newer state": replace_by_newer,
-    "its first reset cancelled": cancel_first_reset,
     "expected in vain": abandon_arriving,  # released, and then abandoned on its way back
 }
 
@@ -248,10 +245,8 @@ ENDS: dict[str, Callable[[Table], object]] = {
 def test_a_session_releases_its_model_however_it_ends_and_others_keep_theirs(end: str) -> None:
     table: Table = SessionTable(limit=10, idle_s=60)
     for name, model in (("a", "model"), ("b", "another")):
-        session = table.open(name, Origin(owner="left" if name == "a" else "right"))
-        session.model = model
-        table.begin(session, None, 0.0)
-        session.steps = session.first = session.expected
+        origin = Origin(owner="left" if name == "a" else "right")
+        opened(table, name, origin).model = model
     ended = table.get("a")
 
     ENDS[end](table)
@@ -262,25 +257,24 @@ def test_a_session_releases_its_model_however_it_ends_and_others_keep_theirs(end
 
 
 @pytest.mark.parametrize(
-    ("steps", "moves", "expected", "is_kept"),
+    ("steps", "moves", "is_kept"),
     [
-        (9, 0, 0, False),
-        (9, 7, 0, False),
-        (9, 7, 9, False),
-        (10, 0, 0, True),  # the announced episode moved here before its announcement
-        (10, 2, 0, True),
-        (11, 0, 0, True),
-        (9, 7, 10, True),  # a reset in progress counts as completed
-        (9, 7, 11, True),
+        (9, 0, False),
+        (9, 7, False),
+        (10, 0, True),  # the announced episode moved here before its announcement
+        (10, 2, True),
+        (11, 0, True),
     ],
 )
 def test_an_announced_episode_ends_the_states_before_it_alone(
-    steps: int, moves: int, expected: int, is_kept: bool
+    steps: int, moves: int, is_kept: bool
 ) -> None:
     table: SessionTable[object] = SessionTable(limit=10, idle_s=60)
-    table.enter(Session("a", steps=steps, moves=moves, expected=expected))
-    table.drop_older({"a": 10, "unknown": 10})
+    table.enter(Session("a", steps=steps, moves=moves, began=3.0))
+    episode = Past((10, 0), 5.0)
+    greater = table.drop_older({"a": episode, "unknown": episode})
     assert ("a" in table) is is_kept
+    assert greater == ({"a": Past((steps, moves), 3.0)} if is_kept else {})
 
     for name in ("a", "unknown"):
         with pytest.raises(Outdated):
@@ -296,10 +290,10 @@ def test_the_states_that_are_rejected_are_those_of_the_sessions_that_left_last(
     for name in "abcde":
         table.enter(Session(name, steps=5))
         table.close(name)
-    table.drop_older({"c": 7})  # as if it had left last
+    table.drop_older({"c": Past((7, 0), 0.0)})  # as if it had left last
     table.enter(Session("f", steps=5))
     table.close("f")
-    assert [name for name in "abcdef" if table.is_past(name, 5)] == ["c", "e", "f"]
+    assert [name for name in "abcdef" if table._newest(name).version >= (5, 0)] == ["c", "e", "f"]
 
 
 def test_sessions_that_can_move_and_were_used_lately_are_counted_by_connection() -> None:
@@ -319,18 +313,20 @@ def test_sessions_that_can_move_and_were_used_lately_are_counted_by_connection()
     assert table.movable_by_connection(within_s=500.0) == {"first": 2, "second": 2}
 
 
-@pytest.mark.parametrize("previous", [None, 3])
-def test_a_cancelled_reset_leaves_its_connection_in_the_episode_that_it_was_in(
-    previous: int | None,
-) -> None:
+def test_an_episode_is_that_of_the_connections_own_waiting_reset_until_it_is_dropped() -> None:
     table: SessionTable[object] = SessionTable(limit=10, idle_s=60)
-    origin = Origin(owner="left", sessions={"a": previous, "b": 4})
-    session = table.open("a", origin)
-    first, before = table.begin(session, None, 0.0, origin)
-    assert (before, origin.sessions) == (previous, {"a": first, "b": 4})
+    left, right = Origin(owner="left"), Origin(owner="right")
+    begun = opened(table, "a", left).first
 
-    second, _ = table.begin(session, None, 0.0, origin)
-    table.undo("a", first, origin, before)
-    assert origin.sessions == {"a": second, "b": 4}, "the session is already in a newer episode"
-    table.undo("a", second, origin, before)
-    assert origin.sessions == {"a": previous, "b": 4}
+    waiting = [
+        table.reserve(pending("a", Request("reset"), origin=origin), {}, follows=True)
+        for origin in (left, right, left)
+    ]
+    assert waiting[0].first < waiting[1].first < waiting[2].first
+    expected = [waiting[2].first, waiting[0].first, begun]
+    for number, dropped in enumerate((2, 0)):
+        assert table.episode_of("a", left) == expected[number]
+        table.undo("a", waiting[dropped])
+    assert table.episode_of("a", left) == begun
+    assert table.episode_of("a", right) == waiting[1].first
+    assert table.get("a").first == begun

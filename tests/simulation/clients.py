@@ -145,8 +145,7 @@ class Robot:
             self.name,
             Obs(info={"id": name, "of": instruction if self.strict else None}),
             link=self.link,
-            # Without a step, only the clocks determine which of two replicas has the newer episode.
-            steady=not (self.steps or (self.gives_up and self.world.clocks_agree)),
+            steady=not (self.steps or self.gives_up),
             timed=self.timed,
             instruction=instruction if op == "reset" else None,
             step=self._step if self.steps else None,

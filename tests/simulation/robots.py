@@ -110,7 +110,7 @@ class World:
         self.queue.bind(driven=True)
         self.pace = ReplicaPace(
             self.queue.window.curve,
-            lambda: [robot.plan for robot in self.robots],
+            lambda: [(robot.plan, robot.waiting is not None) for robot in self.robots],
             LARGEST,
             lambda: self.now,
             lambda: self.queue.depth_of(Priority.ROBOT),
@@ -178,7 +178,6 @@ class World:
         )
         if robot.states_slack and self.slack:
             pending.needed = arrived + (0.0 if robot.lies else slack_s)
-            robot.plan.heard = arrived
             pending.waits_behind_others = robot.plan.waits_behind_others
         if self.deadlines and self.draw.random() < self.deadlines:
             pending.deadline = arrived + self.draw.choice([0.05, 0.3, 2.0])

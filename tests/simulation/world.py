@@ -4,7 +4,7 @@ seed.
 The queue, the sessions, the engine, the moves between replicas and `Sender` are the real ones. A
 replica's thread, its event loop and Ray's calls between replicas are simulated. The duration of a
 batch is random. A message is late, arrives twice or out of order, or waits until a partition heals.
-A replica stops, or is killed or frozen. Clocks are changed.
+A replica starts late, stops, or is killed or frozen. Clocks differ, and are changed.
 """
 
 from __future__ import annotations
@@ -84,7 +84,10 @@ class Replica:
         self.world = world
         self.name = f"replica {number}"
         self.loop = Loop(world.clock)
-        self.clock_error_s = 0.0
+        self.clock_error_s = world.draw.choice(world.plan.clock_errors_s)
+        # Time before which neither clients nor other replicas know the replica. The first replica
+        # starts with the world.
+        self.starts = world.draw.choice(world.plan.starts) if number else 0.0
         self.slowness = world.draw.choice(world.plan.slowness)
         self.draining = False
         self.cut_off_until = 0.0
@@ -106,9 +109,21 @@ class Replica:
         """Whether the process is alive, although it may be frozen."""
         return not self.loop.ended
 
+    @property
+    def is_known(self) -> bool:
+        """Whether the other replicas know this replica."""
+        return self.alive and self.world.clock.now >= self.starts
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the replica accepts clients."""
+        return self.is_known and not self.draining
+
     async def _others(self) -> Sequence[Peer]:
         return [
-            _Peer(self, other) for other in self.world.replicas if other is not self and other.alive
+            _Peer(self, other)
+            for other in self.world.replicas
+            if other is not self and other.is_known
         ]
 
     def _wake(self) -> None:
@@ -230,6 +245,9 @@ class Plan:
         self.latest_s = draw.choice([0.2, 1.0])
         self.twice = draw.choice([0.0, 0.2])
         self.replicas = draw.choice([2, 2, 3])
+        # Possible errors of a replica's clock at its start, and times at which it starts, s.
+        self.clock_errors_s = draw.choice([(0.0,), (0.0, 1.0, 60.0, -3600.0)])
+        self.starts = draw.choice([(0.0,), (0.0, 1.0, 2.0, 4.0)])
         # Share of requests that the load balancer sends to another replica.
         self.stray = draw.choice([0.0, 0.2])
         names = ["drain", "drain", "clock"] + (
@@ -256,11 +274,6 @@ class World:
         for when, name in self.plan.faults:
             self.outside.call_at(when, self._fault, name)
 
-    @property
-    def clocks_agree(self) -> bool:
-        """Return whether no replica's clock has been changed."""
-        return not any(replica.clock_error_s for replica in self.replicas)
-
     def delay_s(self) -> float:
         """Return the delay of a message in s."""
         if self.draw.random() < self.plan.late:
@@ -280,9 +293,7 @@ class World:
 
     def connect(self) -> Link:
         """Return a client's connection to any replica that accepts it."""
-        ready = [
-            replica for replica in self.replicas if replica.alive and not replica.draining
-        ] or self.replicas
+        ready = [replica for replica in self.replicas if replica.is_ready] or self.replicas
         return Link(self, self.draw.choice(ready))
 
     def arrival(self, source: Replica | None, target: Replica | None) -> float:
@@ -312,13 +323,13 @@ class World:
         """Return the replica to which the load balancer sends a request: by its session, and
         sometimes another one unless `steady`.
         """
-        ready = [one for one in self.replicas if one.alive and not one.draining] or self.replicas
+        ready = [one for one in self.replicas if one.is_ready] or self.replicas
         if not steady and self.draw.random() < self.plan.stray:
             return self.draw.choice(ready)
         return ready[sum(session_id.encode()) % len(ready)]
 
     def _fault(self, name: str) -> None:
-        ready = [one for one in self.replicas if one.alive and not one.draining]
+        ready = [one for one in self.replicas if one.is_ready]
         if not ready:
             return
         replica = self.draw.choice(ready)

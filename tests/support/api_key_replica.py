@@ -34,7 +34,7 @@ from dialect_server import (
 )
 from eval_fakes import wait_for
 from gr00t_client import PolicyClient
-from in_flight import answer_to_frame
+from in_flight import answer_to_frame, opened
 from in_memory_keys import ChangingKeys
 from in_process_replicas import InProcess
 from lerobot_messages import AsyncClient, robot_saw
@@ -160,7 +160,7 @@ class Visitor:
             if self.credential == "over its sessions":
                 keys.hold(self.name, 1, None)
         if self.credential == "over its sessions":
-            self.replica.engine.sessions.open(f"{self.name}/held")
+            opened(self.replica.engine.sessions, f"{self.name}/held")
 
 
 class KeyedReplica:

@@ -20,7 +20,8 @@ from vlagents_ray.serve.access.charges import Account
 from vlagents_ray.serve.endpoints.connection import STAMP_SPACE, enable_timestamps, time_in_socket_s
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
+from vlagents_ray.serve.requests import NOWHERE, IncomingMessage, Origin, PendingRequest
+from vlagents_ray.serve.sessions import Session, SessionTable
 
 Done = Callable[[Reply], Any]
 
@@ -75,6 +76,16 @@ def pending(
     if request.deadline_ms is not None:
         one.deadline = one.arrived + request.deadline_ms / 1e3
     return one
+
+
+def opened(
+    table: SessionTable[Any], session_id: str, origin: Origin = NOWHERE, **fields: Any
+) -> Session[Any]:
+    """Return the session, in which a reset has begun an episode; `fields` are fields of the
+    request.
+    """
+    reset = pending(session_id, Request("reset", **fields), origin=origin)
+    return table.begin(session_id, table.reserve(reset, {}, follows=True))
 
 
 def checked(engine: Engine, session_id: str, request: Request, done: Done) -> PendingRequest:

@@ -54,6 +54,7 @@ Op = Literal[
     "adopt",
     "weights",
     "release",
+    "raise_step",
     "prepare",
     "gpu_memory",
     "gpu_work",

@@ -67,8 +67,8 @@ class Origin:
     connection: str = ""
     caller: Caller | None = None  # the holder of the key; None if no key is required
     prefix: str = ""  # prefix of the session ids of the caller's key
-    # The owner's sessions, by their ids in the engine. The value is the first step of the episode
-    # in which the owner last sent a reset or an act; None if it has sent neither.
+    # The sessions that executed a request of the connection, by their ids in the engine. The value
+    # is the first step of the episode of its last reset or act; None if it was neither.
     sessions: dict[str, int | None] = field(default_factory=dict)
     opened: float = 0.0  # time at which the connection was opened, s, of the engine's clock
     # Whether the connection has ended; its waiting requests then have no effect.
@@ -80,26 +80,23 @@ class Origin:
 NOWHERE = Origin()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Opening:
-    """The server's decisions about the episode that a reset begins."""
+    """An episode that a waiting reset will begin, see `SessionTable.reserve`."""
 
     kwargs: dict[str, Any]  # the request's options for the policy
     follows: bool  # whether the episode uses the newest version of the weights
     first: int  # step at which the episode begins
-    # First step of the connection's previous episode, which continues if the reset is undone; None
-    # if there is none.
-    previous: int | None
+    arrived: float  # time at which the reset arrived, s, of the engine's clock
+    origin: Origin  # origin of the reset
 
 
 @dataclass(slots=True, eq=False)
 class ReservedAct:
-    """The reservation of an act: its session and episode, and the work that was done in advance."""
+    """The session of an act, and the work that was done in advance."""
 
     session: Any  # the `Session` when the act arrived
     model: Any  # the `LoadedModel` with whose contract the act was compared, or None
-    # First step of the episode in which the act was sent; None for the session's latest episode.
-    episode: int | None
     preparation: Preparation | None  # preparation of the act's observation, on another thread
 
 
@@ -129,6 +126,10 @@ class PendingRequest:
     sought: bool = False  # whether other replicas were searched for the request's session
     # The reservation of an act or a reset, made before it was queued; see `Intake.reserve`.
     reserved: ReservedAct | Opening | None = None
+    # First step of the episode of the connection when the request arrived; None without a
+    # connection, or if the connection has not used the session.
+    episode: int | None = None
+    executed_by: Any = None  # the `Session` that has executed an act
     # Recent time from an answer to the session's next request, s; None if it is unknown.
     return_s: float | None = None
     index: int = 0  # index of the request in its message
@@ -167,14 +168,28 @@ class PendingRequest:
         """Deliver an error, unless the request is over."""
         self.finish(Reply(self.request.request_id, error=error))
 
-    @property
-    def latest_begin(self) -> float:
-        """Latest time at which the episode of an act can have begun if the connection has not used
-        that episode before, s. A client that continues an episode began it before it opened the
-        connection. A later episode may have begun after the client sent the act, since requests of
-        several connections arrive in any order.
+    def belongs_to(self, first: int, steps: int, began: float) -> bool:
+        """Return whether an act or a close belongs to an episode.
+
+        Without a step, it belongs to the episode of its connection. If the connection has none, it
+        belongs to the episode that had begun when the connection was opened, or over HTTP, when the
+        request arrived: a client that continues an episode began it before. A later episode may
+        have begun after the client sent the request, since requests of several connections arrive
+        in any order.
+
+        Args:
+            first: The step at which the episode began.
+            steps: The step of the session now.
+            began: The time at which the reset of the episode arrived, s, of the engine's clock.
         """
-        return self.origin.opened if self.origin.owner else self.arrived
+        step = self.request.step
+        if step is not None:
+            # A client may close a session although it does not know whether its last act was
+            # executed.
+            return step == steps or (self.request.op == "close" and first <= step < steps)
+        if self.episode is not None:
+            return self.episode == first
+        return began <= (self.origin.opened if self.origin.owner else self.arrived)
 
     def expired(self, now: float) -> bool:
         """Return whether the deadline has passed at `now`, s."""

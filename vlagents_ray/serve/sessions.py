@@ -15,12 +15,18 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
 from vlagents_ray.abilities import Prepares, ability
-from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
+from vlagents_ray.errors import (
+    ConnectionLost,
+    NotReset,
+    PolicyUnavailable,
+    TooManyRequests,
+    UnknownSession,
+)
 from vlagents_ray.interface import Agent, Obs
-from vlagents_ray.serve.in_time import RobotTimes
+from vlagents_ray.serve.in_time import RobotReport, RobotTimes
 from vlagents_ray.serve.queue.preparation import Preparation
 from vlagents_ray.serve.queue.replica_pace import RobotPlan
-from vlagents_ray.serve.requests import NOWHERE, Answer, Origin, PendingRequest
+from vlagents_ray.serve.requests import NOWHERE, Answer, Opening, Origin, PendingRequest
 from vlagents_ray.serve.weights import WeightsVersion
 
 M = TypeVar("M")  # type of a loaded model
@@ -85,7 +91,11 @@ class SessionState:
 
 @dataclass(slots=True)
 class Session(Generic[M]):
-    """The state of a policy for one robot or env."""
+    """The state of a policy for one robot or env.
+
+    Only a request that is executed changes the state. A request that arrives late, is rejected, or
+    is dropped while it waits leaves all fields as they were.
+    """
 
     id: str
     # The session's agent; None until the first `reset` has succeeded, see `set_agent`.
@@ -102,29 +112,59 @@ class Session(Generic[M]):
     # version.
     follows: bool = True
     over: bool = False  # whether the session has ended, so that no table contains it
-    # Origin of the session's last request. Without an owner, the session ends when it is closed or
+    # Origin of the last executed request. Without an owner, the session ends when it is closed or
     # idle for too long.
     origin: Origin = NOWHERE
     # Step of the session's state. Each reset draws a new step above all earlier steps, and each act
     # adds 1.
     steps: int = 0
-    first: int = 0  # step drawn at the last reset that was run
-    expected: int = 0  # step drawn for the latest reset, which may still be queued
-    # Arrival time of the last reset that was run, s, of the engine's clock.
+    first: int = 0  # step drawn for the last executed reset
+    # Arrival time of the last executed reset, s, of the engine's clock.
     began: float = 0.0
-    last_reset: float = 0.0  # arrival time of the latest reset, which may still be queued, s
     moves: int = 0  # number of moves between replicas since the last reset
     # Whether the session was announced to the other replicas, which then keep no older state.
     announced: bool = False
-    used: float = field(default_factory=time.monotonic)  # time of the session's last request, s
+    # Time at which a request was last executed, s, of `time.monotonic`.
+    used: float = field(default_factory=time.monotonic)
     # Reports of the session's robot at this replica; None before the first report.
     times: RobotTimes | None = None
     plan: RobotPlan = field(default_factory=RobotPlan)  # plan of the robot in this episode
 
     @property
     def version(self) -> Version:
-        """Version of the session's state; a reset in progress counts as completed."""
-        return max((self.steps, self.moves), (self.expected, 0))
+        """Version of the session's state; a reset that the policy executes counts as completed."""
+        return self.steps, self.moves
+
+    def begin(self, opening: Opening) -> None:
+        """End the current episode, and begin the episode of a reset, which has no agent yet."""
+        self.set_agent(None)
+        self.steps = self.first = opening.first
+        self.moves = 0
+        self.began = opening.arrived
+        self.plan = RobotPlan(began=opening.arrived, heard=opening.arrived)
+
+    def advance(self) -> int:
+        """Record that the policy has executed an act, and return the new step."""
+        self.steps += 1
+        return self.steps
+
+    def has_episode_of(self, pending: PendingRequest) -> bool:
+        """Return whether an act or a close belongs to the session's current episode."""
+        return pending.belongs_to(self.first, self.steps, self.began)
+
+    def require_episode_of(self, pending: PendingRequest) -> None:
+        """Raise an error unless an act can be executed in the session's current episode."""
+        if self.agent is None:
+            raise NotReset(f"session {self.id!r}: its last reset failed; reset again")
+        if not self.has_episode_of(pending):
+            step = pending.request.step
+            raise self.wrong_episode() if step is None else self.wrong_step(step)
+
+    def add_report(self, report: RobotReport, now: float) -> None:
+        """Add the report of the session's robot that arrived at `now`, s."""
+        if self.times is None:
+            self.times = RobotTimes()
+        self.times.add(report, now)
 
     def set_agent(self, agent: Agent | None) -> None:
         """Set the agent with which the session acts from now on; None without an episode.
@@ -149,6 +189,15 @@ class Session(Generic[M]):
         )
 
 
+@dataclass(frozen=True, slots=True)
+class SessionUse:
+    """The use that a waiting request makes of a session at another replica."""
+
+    origin: Origin = NOWHERE  # origin of the request, for whose key the session counts
+    # Whether the request closes the session, which then ends where it is.
+    ends: bool = False
+
+
 class SessionFinder(Protocol):
     """Fetches sessions from other replicas:
     `vlagents_ray.serve.scaling.session_migration.SessionMigrator`.
@@ -159,27 +208,42 @@ class SessionFinder(Protocol):
         session_id: str,
         then: Callable[[], None],
         caller: str = "",
-        user: Callable[[SessionState, float], Origin | None] = ...,
+        user: Callable[[SessionState, float], SessionUse | None] = ...,
     ) -> bool:
-        """Fetch a session if a request can act on it (`user`), then call `then` whether the session
-        was found or not; return False if `caller` has too many searches.
+        """Fetch or close a session if a request can use it (`user`), then call `then` whether the
+        session was found or not; return False if `caller` has too many searches.
         """
 
-    def announce(self, session_id: str, step: int, answer: Answer | None = None) -> None:
-        """Announce to the other replicas that the session has begun an episode at this replica at
-        `step`, so that they drop older states.
+    def announce(self, session: Session[Any], answer: Answer) -> None:
+        """Announce to the other replicas that the session has begun an episode at this replica, so
+        that they drop older states.
 
         The `answer` to the reset is delivered once these states are dropped, or after a short time.
         """
 
 
+@dataclass(frozen=True, slots=True)
+class Past:
+    """The newest state that a replica had of a session that is no longer there."""
+
+    version: Version
+    began: float  # time at which its episode began, s, of the engine's clock
+
+
+_NO_PAST = Past((0, 0), 0.0)
+
+
 class SessionTable(Generic[M]):
     """The sessions of a replica, by id. Thread-safe.
+
+    A waiting reset reserves an `Opening`: a step and, for a new session, room. Everything else
+    changes when the policy's thread executes a request.
 
     A session never returns to an older state: a replica keeps the newest state that it has had, and
     rejects older states. Steps are drawn from the wall clock, so that a step drawn at another
     replica exceeds all steps drawn before. A new step is always above all steps that the session's
-    client and this replica know, even if the clocks are wrong.
+    client and this replica know, even if the clocks are wrong. If another replica knows a greater
+    step of an older episode, since its clock is ahead, `raise_step` raises the new step above it.
     """
 
     def __init__(
@@ -196,123 +260,167 @@ class SessionTable(Generic[M]):
             clock: Wall clock, ns.
         """
         self._sessions: dict[str, Session[M]] = {}
+        # Episodes of waiting resets by session, in the order of their arrival.
+        self._openings: dict[str, tuple[Opening, ...]] = {}
         self._expected: list[Session[M]] = []  # sessions that are arriving from other replicas
         self.limit = limit
         self.opened = 0  # number of sessions opened so far
         self._idle_s, self._clock = idle_s, clock
         self._drawn = 0  # latest step drawn
-        # Version up to which the states of a session that left are rejected, by session.
-        self._left: OrderedDict[str, Version] = OrderedDict()
+        # State up to which the states of a session that left are rejected, by session.
+        self._left: OrderedDict[str, Past] = OrderedDict()
         self._lock = threading.RLock()
 
     def __len__(self) -> int:
         return len(self._sessions)
 
     def __contains__(self, session_id: object) -> bool:
-        return session_id in self._sessions
+        """Return whether the session is here, or a waiting reset will open it here."""
+        return session_id in self._sessions or session_id in self._openings
 
     def get(self, session_id: str) -> Session[M]:
-        """Return the session, and mark it as used.
+        """Return the session.
 
         Raises:
+            NotReset: The first reset of the session waits.
             UnknownSession: The table does not have the session.
         """
         session = self._sessions.get(session_id)
-        if session is None:
-            raise UnknownSession(
-                f"session {session_id!r}: unknown here; it was never reset, idled for "
-                f"{self._idle_s:g} s, or its replica was replaced: send a reset first"
-            )
-        session.used = time.monotonic()
-        return session
+        if session is not None:
+            return session
+        if session_id in self._openings:
+            raise NotReset(f"session {session_id!r}: act before a successful reset; reset first")
+        raise self.unknown(session_id)
 
-    def open(self, session_id: str, origin: Origin = NOWHERE) -> Session[M]:
-        """Return the session, which is created if it is new, for a request from `origin`.
+    def unknown(self, session_id: str) -> UnknownSession:
+        """Return the error for a request of a session that the table does not have."""
+        return UnknownSession(
+            f"session {session_id!r}: unknown here; it was never reset, idled for "
+            f"{self._idle_s:g} s, or its replica was replaced: send a reset first"
+        )
+
+    def episode_of(self, session_id: str, origin: Origin) -> int | None:
+        """Return the first step of the episode in which a connection uses the session: that of its
+        waiting reset, or of its last executed request; None if there is none.
+        """
+        if not origin.owner:
+            return None
+        for opening in reversed(self._openings.get(session_id, ())):
+            if opening.origin is origin:
+                return opening.first
+        return origin.sessions.get(session_id)
+
+    def reserve(self, pending: PendingRequest, kwargs: dict[str, Any], follows: bool) -> Opening:
+        """Reserve an episode for a reset that will wait, and room for its session if it is new.
+
+        Args:
+            pending: The reset. The drawn step is above the step that its client reports.
+            kwargs: Its options for the policy.
+            follows: Whether its episode uses the newest version of the weights.
 
         Raises:
             PolicyUnavailable: The replica has reached its limit of sessions.
-            TooManyRequests: The key of the origin's caller has reached its limit of sessions.
+            TooManyRequests: The key of the caller has reached its limit of sessions.
         """
+        session_id, known = pending.session_id, pending.request.step
         with self._lock:
-            session = self._sessions.get(session_id)
-            if session is None:
-                self.require_room([session_id], origin)
-                session = self._sessions[session_id] = Session(session_id)
-                self.opened += 1
-        session.used = time.monotonic()
-        session.origin = origin
-        return session
+            self.require_room([session_id], pending.origin)
 
-    def begin(
-        self, session: Session[M], known: int | None, arrived: float, origin: Origin = NOWHERE
-    ) -> tuple[int, int | None]:
-        """Draw the step at which the session's next episode begins.
-
-        Args:
-            session: The session.
-            known: The step that the client reports; the drawn step is above it.
-            arrived: Time at which the reset arrived, s, of the engine's clock.
-            origin: Origin of the reset, whose connection belongs to the new episode from now on.
-
-        Returns:
-            The step, and the step of the connection's previous episode, which is None if there is
-            none.
-        """
-        with self._lock:
-            before = max(session.version, self._left.get(session.id, (0, 0)))[0]
+            waiting = self._openings.get(session_id, ())
+            before = max(self._newest(session_id).version[0], *(one.first for one in waiting), 0)
             if known is not None and known < _MOST_STEP:
                 before = max(before, known)
             self._drawn = max(self._clock(), self._drawn + 1)
-            session.expected = max(self._drawn, before + _UNSEEN)
-            session.last_reset = arrived
-            previous = origin.sessions.get(session.id)
-            if origin.owner:
-                origin.sessions[session.id] = session.expected
-            return session.expected, previous
+            first = max(self._drawn, before + _UNSEEN)
+            opening = Opening(kwargs, follows, first, pending.arrived, pending.origin)
+            self._openings[session_id] = (*waiting, opening)
+            return opening
 
-    def end_episode(self, session: Session[M], reset: PendingRequest, first: int) -> None:
-        """End the session's episode, since the policy's thread runs a reset, whose episode begins
-        at the step `first`.
+    def undo(self, session_id: str, opening: Opening) -> None:
+        """Drop the reservation of a reset that will not be executed."""
+        with self._lock:
+            waiting = tuple(one for one in self._openings.get(session_id, ()) if one is not opening)
+            if waiting:
+                self._openings[session_id] = waiting
+            else:
+                self._openings.pop(session_id, None)
+
+    def begin(self, session_id: str, opening: Opening) -> Session[M]:
+        """Begin the episode of a reset that the policy's thread executes, and return its session.
+
+        Raises:
+            UnknownSession: The session is past the episode, at this or another replica.
+            ConnectionLost: The connection of the reset has ended.
         """
         with self._lock:
-            session.set_agent(None)
-            session.steps = session.first = first
-            session.moves = 0
-            session.plan = RobotPlan(began=reset.arrived, heard=reset.arrived)
-            session.expected = max(session.expected, first)
-            session.began = reset.arrived
-            session.last_reset = max(session.last_reset, reset.arrived)
+            try:
+                is_void = opening not in self._openings.get(session_id, ())
+                if is_void or self._newest(session_id).version[0] >= opening.first:
+                    raise UnknownSession(
+                        f"session {session_id!r}: reset elsewhere, or ended, while this reset "
+                        "waited"
+                    )
+                session = self._sessions.get(session_id) or Session(session_id)
+                self._own(session, opening.origin, opening.first)
+            finally:
+                self.undo(session_id, opening)
+            if session_id not in self._sessions:
+                self._sessions[session_id] = session
+                self.opened += 1
+            session.begin(opening)
+            return session
 
-    def undo(
-        self,
-        session_id: str,
-        first: int,
-        origin: Origin = NOWHERE,
-        previous: int | None = None,
-    ) -> None:
-        """Undo `begin` for a reset that was cancelled. The current episode continues, at this or
-        another replica.
-        """
-        with self._lock:
-            if origin.sessions.get(session_id) == first:
-                origin.sessions[session_id] = previous
-            session = self._sessions.get(session_id)
-            if session is None or session.expected != first or session.steps == first:
-                return
-            session.expected, session.last_reset = session.first, session.began
-            if session.steps == 0:  # the reset was the first reset of the session at this replica
-                del self._sessions[session_id]
-                self._end(session)
+    def use(self, session: Session[M], origin: Origin) -> None:
+        """Record that the policy's thread executes a request of `origin` in the session.
 
-    def is_past(self, session_id: str, first: int) -> bool:
-        """Return whether the session, at this or another replica, is past an episode that should
-        begin at the given step.
+        Raises:
+            ConnectionLost: The connection of the request has ended.
         """
+        session.used = time.monotonic()
+        if session.origin is origin and origin.sessions.get(session.id) == session.first:
+            return  # this is nearly always the case, and avoids taking the lock
         with self._lock:
-            session = self._sessions.get(session_id)
-            return self._left.get(session_id, (0, 0))[0] >= first or (
-                session is not None and session.steps > first
+            self._own(session, origin, session.first)
+
+    def _own(self, session: Session[M], origin: Origin, first: int) -> None:
+        """Let the session belong to the connection of `origin`, in the episode that begins at the
+        step `first`; the caller holds the lock.
+        """
+        if origin.ended:
+            raise ConnectionLost(
+                "the request's connection has ended: not acted on, and never will be"
             )
+        session.used = time.monotonic()
+        session.origin = origin
+        if origin.owner:
+            origin.sessions[session.id] = first
+
+    def raise_step(self, session_id: str, first: int, above: int) -> int | None:
+        """Raise the first step of an episode above a step that another replica knows, since the
+        clock of that replica is ahead. The policy's thread calls this method.
+
+        Returns:
+            The new first step; None if the session is no longer in the episode that begins at the
+            step `first`.
+        """
+        with self._lock:
+            session = self._sessions.get(session_id)
+            if session is None or session.first != first:
+                return None
+            raised = above + _UNSEEN
+            session.steps += raised - first
+            session.first = raised
+            if session.origin.owner:
+                session.origin.sessions[session_id] = raised
+            return raised
+
+    def _newest(self, session_id: str) -> Past:
+        """Return the newest state of the session that this table has or had."""
+        newest = self._left.get(session_id, _NO_PAST)
+        session = self._sessions.get(session_id)
+        if session is not None and session.version > newest.version:
+            return Past(session.version, session.began)
+        return newest
 
     def require_room(self, session_ids: Sequence[str], origin: Origin = NOWHERE) -> None:
         """Raise an error unless there is room for all of these sessions, of which some may exist.
@@ -322,14 +430,18 @@ class SessionTable(Generic[M]):
             TooManyRequests: The key of the origin's caller would exceed its limit of sessions.
         """
         with self._lock:
-            new = sum(session_id not in self._sessions for session_id in session_ids)
+            new = sum(session_id not in self for session_id in session_ids)
             if not new:
                 return
             self.require_allowed(origin, new)
-            if len(self._sessions) + new > self.limit:
+            if self._held() + new > self.limit:
                 self.drop_idle()
-            if len(self._sessions) + new > self.limit:
+            if self._held() + new > self.limit:
                 raise self.full()
+
+    def _held(self) -> int:
+        """Return the number of sessions, and of sessions that waiting resets will open."""
+        return len(self._sessions.keys() | self._openings.keys())
 
     def full(self) -> PolicyUnavailable:
         """Return the error for a client whose session exceeds the replica's limit."""
@@ -356,17 +468,13 @@ class SessionTable(Generic[M]):
             self._sessions[arriving.id] = arriving
 
     def _require_newer(self, arriving: Session[M]) -> None:
-        present = self._sessions.get(arriving.id)
-        newest = self._left.get(arriving.id, (0, 0))
-        if present is not None:
-            newest = max(newest, present.version)
-        if arriving.version <= newest:
+        if arriving.version <= self._newest(arriving.id).version:
             raise Outdated(
                 f"session {arriving.id!r}: this replica has, or had, a newer state of it; reset it"
             )
 
-    def expect(self, arriving: Session[M]) -> None:
-        """Count a session that is arriving from another replica for the key of its origin.
+    def expect(self, arriving: Session[M], origin: Origin) -> None:
+        """Count a session that is arriving from another replica for the key of a request's origin.
 
         Raises:
             Outdated: This replica has, or had, a state that is at least as new.
@@ -374,8 +482,8 @@ class SessionTable(Generic[M]):
         """
         with self._lock:
             self._require_newer(arriving)
-            if arriving.id not in self._sessions:
-                self.require_allowed(arriving.origin)
+            if arriving.id not in self:
+                self.require_allowed(origin)
             self._expected.append(arriving)
 
     def abandon(self, arriving: Session[M]) -> None:
@@ -407,22 +515,61 @@ class SessionTable(Generic[M]):
             }
 
     def versions(self) -> dict[str, Version]:
-        """Return the versions of all sessions, including sessions whose first reset is
-        in progress.
-        """
+        """Return the versions of all sessions, including sessions whose first reset waits."""
         with self._lock:
-            return {session.id: session.version for session in self._sessions.values()}
+            waiting = {name: (one[0].first, 0) for name, one in self._openings.items()}
+            return waiting | {session.id: session.version for session in self._sessions.values()}
 
-    def drop_older(self, steps: Mapping[str, int]) -> None:
-        """Close the sessions whose states are older than `steps`, at which other replicas began
-        episodes, and reject such states.
+    def drop_older(self, episodes: Mapping[str, Past]) -> dict[str, Past]:
+        """Close the sessions whose states are older than `episodes`, which other replicas have
+        begun, and reject such states.
+
+        The clocks of replicas differ, so that the order of steps may differ from the order in which
+        the resets arrived.
+
+        Args:
+            episodes: The steps at which the episodes begin, and estimates of the times at which
+                their resets arrived, which are not earlier than the true times.
+
+        Returns:
+            The states that contradict this order, by session: an episode of this table that has
+            certainly begun later, and is kept; or otherwise the greatest step, not below the step
+            of the announced episode, that this table has, had, or has reserved for a waiting reset,
+            although its reset arrived earlier.
+        """
+        contradicting: dict[str, Past] = {}
+        with self._lock:
+            for session_id, episode in episodes.items():
+                session = self._sessions.get(session_id)
+                if session is not None and session.began > episode.began:
+                    contradicting[session_id] = Past(session.version, session.began)
+                    continue
+
+                waiting = self._openings.get(session_id, ())
+                known = [Past((opening.first, 0), opening.arrived) for opening in waiting]
+                known.append(self._newest(session_id))
+                greater = [
+                    past
+                    for past in known
+                    if past.version >= episode.version and past.began < episode.began
+                ]
+                if greater:
+                    contradicting[session_id] = max(greater, key=lambda past: past.version)
+                if session is not None and session.version < episode.version:
+                    self._forget(session_id)
+                self._remember(session_id, Past((episode.version[0] - 1, _ANY), episode.began))
+        return contradicting
+
+    def void(self, session_id: str, first: int, later: Version) -> None:
+        """Remove the session if its episode began at the step `first`, since another replica has
+        begun an episode later, whose version `later` may be smaller.
         """
         with self._lock:
-            for session_id, step in steps.items():
-                session = self._sessions.get(session_id)
-                if session is not None and session.version < (step, 0):
-                    self._forget(session_id)
-                self._remember(session_id, (step - 1, _ANY))
+            session = self._sessions.get(session_id)
+            if session is not None and session.first == first:
+                del self._sessions[session_id]
+                self._end(session)
+                self._remember(session_id, Past((later[0] - 1, _ANY), session.began))
 
     def require_allowed(self, origin: Origin, new: int = 1) -> None:
         """Raise `TooManyRequests` if the key of the origin's caller may not have this number of new
@@ -442,19 +589,35 @@ class SessionTable(Generic[M]):
         )
 
     def _number_of(self, prefix: str) -> int:
-        names = [*self._sessions, *(session.id for session in self._expected)]
-        return sum(name.startswith(prefix) for name in names)
+        names = self._sessions.keys() | self._openings.keys()
+        return sum(name.startswith(prefix) for name in names) + sum(
+            arriving.id.startswith(prefix) for arriving in self._expected
+        )
 
-    def close(self, session_id: str, origin: Origin = NOWHERE) -> None:
-        """Close the session. It no longer belongs to its connection, unless the connection has sent
-        a reset meanwhile. Unknown ids are ignored.
+    def close(self, session_id: str) -> None:
+        """Close the session. Unknown ids are ignored."""
+        with self._lock:
+            self._forget(session_id)
+
+    def close_for(self, pending: PendingRequest) -> None:
+        """Execute a close, which has no effect on a later episode of its session, or of another
+        connection.
+
+        Raises:
+            UnknownSession: The table does not have the session.
+        """
+        session_id = pending.session_id
+        with self._lock:
+            pending.origin.sessions.pop(session_id, None)
+            if self.get(session_id).has_episode_of(pending):
+                self._forget(session_id)
+
+    def end_elsewhere(self, session_id: str, version: Version, began: float) -> None:
+        """Reject the states of a session that a request of this replica has closed at another
+        replica.
         """
         with self._lock:
-            session = self._sessions.get(session_id)
-            first = origin.sessions.get(session_id)
-            if session is None or first is None or first <= session.steps:
-                origin.sessions.pop(session_id, None)
-            self._forget(session_id)
+            self._remember(session_id, Past((version[0], _ANY), began))
 
     def release(self, session_id: str, version: Version) -> bool:
         """Release the session to another replica, which has a copy of the given version; return
@@ -467,25 +630,25 @@ class SessionTable(Generic[M]):
             self._forget(session_id, version)
             return True
 
-    def close_owned(self, connection: str, session_ids: Iterable[str]) -> None:
-        """Close the given sessions, except those that no longer end with the connection."""
+    def close_owned(self, origin: Origin) -> None:
+        """Close the sessions of a connection that has ended, except those that belong to another
+        connection now. Its waiting resets are void.
+        """
         with self._lock:
-            for session_id in session_ids:
-                session = self._sessions.get(session_id)
-                if session is not None and session.origin.owner == connection:
-                    self._discard(session)
+            self.discard([*origin.sessions, *self._openings], origin)
 
-    def discard(self, session_ids: Iterable[str]) -> None:
-        """Close sessions that a message has begun in vain."""
+    def discard(self, session_ids: Iterable[str], origin: Origin) -> None:
+        """Close the sessions among the given ones that belong to `origin`, and make its waiting
+        resets of them void.
+        """
         with self._lock:
-            for session_id in session_ids:
+            for session_id in set(session_ids):
+                for opening in self._openings.get(session_id, ()):
+                    if opening.origin is origin:
+                        self.undo(session_id, opening)
                 session = self._sessions.get(session_id)
-                if session is not None:
-                    self._discard(session)
-
-    def _discard(self, session: Session[M]) -> None:
-        # This version makes a waiting reset void.
-        self._forget(session.id, (max(session.steps, session.expected), _ANY))
+                if session is not None and session.origin is origin:
+                    self._forget(session_id)
 
     def close_all(self) -> None:
         """Close all sessions, and drop their agents, since the model of these agents is closed.
@@ -534,7 +697,7 @@ class SessionTable(Generic[M]):
     def _forget(self, session_id: str, left: Version | None = None) -> None:
         session = self._sessions.pop(session_id, None)
         if session is not None:
-            self._remember(session_id, left or (session.steps, _ANY))
+            self._remember(session_id, Past(left or (session.steps, _ANY), session.began))
             self._end(session)
 
     def _end(self, session: Session[M]) -> None:
@@ -543,8 +706,9 @@ class SessionTable(Generic[M]):
         session.stored.clear()
         session.model = None
 
-    def _remember(self, session_id: str, version: Version) -> None:
-        self._left[session_id] = max(version, self._left.pop(session_id, version))
+    def _remember(self, session_id: str, past: Past) -> None:
+        before = self._left.pop(session_id, past)
+        self._left[session_id] = past if past.version > before.version else before
         if len(self._left) > _REMEMBERED:
             self._left.popitem(last=False)
 

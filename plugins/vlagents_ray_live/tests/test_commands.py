@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import Clock, wait_for
+from in_flight import opened
 from in_memory_keys import ChangingKeys
 from live_server import LiveServer, ask, live_server
 
@@ -41,7 +42,7 @@ class Board:
     def __init__(self) -> None:
         self.clock = Clock()
         self.sessions: SessionTable[Any] = SessionTable(10, 60.0)
-        self.sessions.open("arm")
+        opened(self.sessions, "arm")
         self.board = CommandBoard(self.sessions, clock=self.clock)
 
     def press(self, do: str, episode: str | None = None) -> str:

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import pytest
+from in_flight import opened
 from live_server import METADATA
 
 from vlagents_ray.errors import UnknownSession
@@ -194,10 +195,10 @@ def test_a_slow_viewer_misses_the_oldest(
 def test_a_snapshot_has_the_share_in_time_of_each_robot(own: ReplicaView) -> None:
     engine = own._engine
     for name, starved in (("good", 1), ("late", 10)):
-        session = engine.sessions.open(name)
+        session = opened(engine.sessions, name)
         session.times = RobotTimes()
         session.times.add(RobotReport(100, starved, 80.0), engine.clock())
-    engine.sessions.open("silent")
+    opened(engine.sessions, "silent")
 
     document = own.read(0, ()).document
     assert {one["id"]: one["in_time"] for one in document["sessions"]} == {

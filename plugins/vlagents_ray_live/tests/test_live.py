@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import Clock
+from in_flight import opened
 
 from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import InvalidInput, MessageTooLarge, Overloaded, StorageFailed
@@ -274,7 +275,7 @@ def test_a_snapshot_and_what_is_sent_of_it_are_bounded(monkeypatch: pytest.Monke
     names = [str(number) for number in range(10)]
     view.live.renew()
     for name in names:
-        engine.sessions.open(name)
+        opened(engine.sessions, name)
         image = np.zeros((8, 8, 3), np.uint8)
         send(
             view.live,

@@ -27,7 +27,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frames
 from vlagents_ray.protocol.frames import Decoded, decode_replies
 from vlagents_ray.protocol.messages import (
-    BACKGROUND_OPS,
+    IMMEDIATE_OPS,
     INNER_OPS,
     MessageLimits,
     Op,
@@ -426,22 +426,16 @@ def test_no_request_is_executed_of_which_a_deadline_said_that_it_never_will_be(
     assert policy.executed == ([] if step == "take" else [op])
 
 
-@pytest.mark.parametrize(
-    ("op", "uses_session"),
-    [
-        *[(op, True) for op in ("call", "export", "adopt", "weights")],
-        *[(op, False) for op in ("close", *BACKGROUND_OPS)],
-    ],
-)
+@pytest.mark.parametrize("op", [op for op in INNER_OPS if op not in (*IMMEDIATE_OPS, "close")])
 @pytest.mark.parametrize("owner", ["connection", ""])
-def test_only_a_connection_keeps_the_sessions_that_its_requests_use(
-    served: Served, op: Op, uses_session: bool, owner: str
+def test_no_connection_has_a_session_before_its_request_is_executed(
+    served: Served, op: Op, owner: str
 ) -> None:
     origin = Origin(owner=owner)
-    for session in ("a", "b", "a"):
-        request = pending(session, Request(op), origin=origin)
-        assert served.engine.intake.reserve(request) is None
-    assert set(origin.sessions) == ({"a", "b"} if owner and uses_session else set())
+    request = pending("first", Request(op, Obs(), session="first"), origin=origin)
+    served.engine.intake.reserve(request)
+    assert origin.sessions == {}
+    assert served.engine.sessions.get("first").origin is served.first._origin
 
 
 @pytest.mark.parametrize("op", [op for op in INNER_OPS if not op.startswith("gpu_")])

@@ -20,9 +20,14 @@ class Robots:
         self.plans = list(plans)
         self.now = 100.0
         self.waiting = 0
+        self.requests: list[RobotPlan] = []  # plans of robots whose requests wait
         self.pace = ReplicaPace(
-            lambda: PI0, lambda: self.plans, 16, lambda: self.now, lambda: self.waiting
+            lambda: PI0, self._plans, 16, lambda: self.now, lambda: self.waiting
         )
+
+    def _plans(self) -> list[tuple[RobotPlan, bool]]:
+        waiting = {id(plan) for plan in self.requests}
+        return [(plan, id(plan) in waiting) for plan in self.plans]
 
     def read(self) -> list[bool]:
         """Let the pace read the plans again, and return whether each robot waits behind others."""
@@ -139,10 +144,12 @@ def test_a_robot_whose_request_waits_behind_others_still_counts() -> None:
     robots = Robots(*plans(OF_50, 600))
     robots.read()
     for plan in robots.plans:
-        plan.heard, plan.asked = robots.now, robots.now - 5.0
+        plan.heard = robots.now
     robots.now += 30.0
     for plan in robots.plans:
-        if not plan.waits_behind_others:
+        if plan.waits_behind_others:
+            robots.requests.append(plan)
+        else:
             plan.heard = robots.now
     waits = robots.read()
     assert waits.count(True) > 150

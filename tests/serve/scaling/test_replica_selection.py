@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from in_flight import opened
 from in_process_replicas import Replicas
 
 from vlagents_ray import Act, Agent, Obs
@@ -173,7 +174,7 @@ def test_a_client_is_expected_until_its_session_is_there(monkeypatch: pytest.Mon
     mine.expect_client()
     mine.expect_client()
     assert mine.load().sessions == 2
-    engine.sessions.open("one")
+    opened(engine.sessions, "one")
     assert mine.load().sessions == 2
     monkeypatch.setattr(balancing, "_EXPECTED_S", 0.0)
     time.sleep(0.01)

@@ -268,7 +268,9 @@ def test_a_reset_is_answered_if_its_replica_stops_meanwhile(
     served.frozen.add(1)
     answers = begin(served.engines[0], "reset", instruction="episode 1")
     migrator = served.migrators[0]
-    wait_for(lambda: migrator._tasks and bool(migrator._announced) == bool(gather_s), every_s=0.001)
+    wait_for(
+        lambda: migrator._tasks and bool(migrator._unannounced) == bool(gather_s), every_s=0.001
+    )
     asyncio.run_coroutine_threadsafe(served.migrators[0].close(), served._loop).result(20)
     assert answers.get(timeout=20).error is None
 

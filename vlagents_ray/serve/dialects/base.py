@@ -582,7 +582,7 @@ async def act_together(
     except BaseException:
         for session_obs in ending:
             session_obs.session.episode.end()
-        engine.sessions.discard(new_ids)
+        observations[0].session._sender.discard(new_ids)
         raise
     return replies
 

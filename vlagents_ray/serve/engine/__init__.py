@@ -16,33 +16,41 @@ PendingRequest.begun
     writers: policy: FairQueue.take, BatchQueue.give_back
     protection: lock of the queue
 
-PendingRequest.reserved, .sought
+PendingRequest.reserved, .episode, .sought
     writers: the thread that reserves for the request
     protection: only one thread at a time reserves for, searches for or queues a request
 
+PendingRequest.executed_by
+    writers: policy
+    protection: one writer
+
 Origin.sessions: episodes
-    writers: each thread that reserves or undoes a reset, policy at a close
-    protection: lock of SessionTable; an act sets an episode only if there is none
+    writers: policy
+    protection: one writer; changes lock SessionTable, except those of inner operations
 
 Origin.ended
     writers: the thread that ends the connection
     protection: is only ever set
 
-Session.agent, .prepares, .model, .steps, .instruction, .announced
+Session: all fields but those below
     writers: policy; before the session is in the table, the thread that creates it
-    protection: one writer
+    protection: one writer; a reader gets the old or the new value
 
-Session.plan
-    writers: policy, at resets and answers
-    protection: single assignments; a reader gets the old or the new value
-
-Session.first, .expected, .began, .last_reset, .moves, .over
-    writers: each thread that reserves, runs or undoes a reset
+Session.over, .model at the end of the session
+    writers: each thread that ends the session
     protection: lock of SessionTable
 
-Session.origin, .used
-    writers: each thread that reserves for a request of the session
-    protection: the last value counts: requests of two threads have no order
+Session.announced
+    writers: event loop
+    protection: one writer
+
+Session.times
+    writers: each thread that answers an act
+    protection: one answer at a time; RobotTimes has a lock
+
+SessionTable: openings of waiting resets
+    writers: each thread that reserves or undoes a reset, policy
+    protection: lock of SessionTable
 
 ServedModel: model, settings
     writers: policy; the thread that closes the engine, after the policy's thread has ended

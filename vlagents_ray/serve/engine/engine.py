@@ -34,7 +34,7 @@ from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.call_limits import PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
-from vlagents_ray.serve.queue.replica_pace import ReplicaPace
+from vlagents_ray.serve.queue.replica_pace import ReplicaPace, RobotPlan
 from vlagents_ray.serve.sessions import DrainList, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import Rest, WeightUpdates
 
@@ -107,7 +107,7 @@ class Engine:
 
         self.pace = ReplicaPace(
             self.queue.window.curve,
-            lambda: [session.plan for session in self.sessions.all()],
+            self._plans,
             settings.max_batch_size,
             clock,
             lambda: self.queue.depth_of(Priority.ROBOT),
@@ -173,6 +173,11 @@ class Engine:
             except Exception as error:
                 raise self.health.fail_loading(error) from error
             self.health.finish_loading()
+
+    def _plans(self) -> list[tuple[RobotPlan, bool]]:
+        """Return the plan of each session, and whether a request of the session waits."""
+        waiting = self.queue.waiting_sessions()
+        return [(session.plan, session.id in waiting) for session in self.sessions.all()]
 
     def collect_stats(self) -> Collected:
         """Return the metrics recorded since the last call, including the processes of policies that

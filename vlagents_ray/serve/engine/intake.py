@@ -1,9 +1,10 @@
 """The path of requests into the queue: each request is checked, and makes its reservations.
 
-A reset reserves an episode of its session. An act reserves its session and the episode to which it
-belongs. A reservation is a value in its request, so that it can be undone if the policy never
-receives the request. If the session of an act is not at this replica, the act reserves again after
-a search at other replicas.
+A reset reserves the step of an episode, and room for its session. An act reserves its session, and
+the preparation of its observation. A reservation is a value in its request, and is dropped if the
+policy never receives the request; no session changes before its request is executed. If the session
+of an act or a close is not at this replica, the request reserves again after a search at other
+replicas.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from vlagents_ray.serve.engine.background_calls import BackgroundCalls
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.parts import EngineParts
 from vlagents_ray.serve.engine.responses import public_error
-from vlagents_ray.serve.in_time import RobotReport, RobotTimes
+from vlagents_ray.serve.in_time import RobotReport
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.queue.preparation import Preparation, Preparations
 from vlagents_ray.serve.queue.replica_pace import stated_slack_s
-from vlagents_ray.serve.requests import Opening, Origin, PendingRequest, ReservedAct
-from vlagents_ray.serve.sessions import Session, SessionState
+from vlagents_ray.serve.requests import Opening, PendingRequest, ReservedAct
+from vlagents_ray.serve.sessions import Session, SessionState, SessionUse
 from vlagents_ray.serve.weights import follows
 
-# Operations after which a connection does not have the request's session.
-_USE_NO_SESSION = ("close", *BACKGROUND_OPS)
+# Operations whose session may be at another replica.
+_SEARCHED = ("act", "close")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,15 +51,15 @@ class ReceivedReport:
     """The report of a robot in a request that is not answered yet."""
 
     report: RobotReport
-    times: RobotTimes  # of the robot's session
-    priority: str
+    pending: PendingRequest
     stats: MetricsBuffer
     clock: Callable[[], float]
 
     def count(self) -> None:
-        """Add the report to the session and to the metrics."""
-        self.times.add(self.report, self.clock())
-        self.stats.report(self.priority, self.report)
+        """Add the report to the metrics, and to the session if it has executed the request."""
+        self.stats.report(self.pending.priority.name.lower(), self.report)
+        if self.pending.executed_by is not None:
+            self.pending.executed_by.add_report(self.report, self.clock())
 
 
 class Intake:
@@ -89,6 +90,7 @@ class Intake:
                     info = self._execute(pending)
                     pending.finish(Reply(pending.request.request_id, info=info))
                     continue
+                pending.episode = self._sessions.episode_of(pending.session_id, pending.origin)
                 reserved = pending.reserved = self.reserve(pending)
                 if reserved is None and pending.request.op in BACKGROUND_OPS:
                     self._background.submit(pending)
@@ -144,11 +146,12 @@ class Intake:
 
     def reserve(self, pending: PendingRequest) -> ReservedAct | Opening | None:
         """Check a request before it is queued, and return its reservation; raise an error if it is
-        rejected. The session of the request becomes a session of its connection.
+        rejected.
         """
         request, origin, session_id = pending.request, pending.origin, pending.session_id
         is_act = request.op == "act"
-        if is_act and origin.owner and not request.session and session_id not in origin.sessions:
+        is_unnamed = bool(origin.owner) and not request.session
+        if is_act and is_unnamed and pending.episode is None and session_id not in origin.sessions:
             raise NotReset("act before reset: this connection has no session yet; reset first")
         self._health.require_ready()
 
@@ -163,67 +166,41 @@ class Intake:
             preparation = _take_stored(session, pending) if is_stored else None
             request = pending.request
             step = request.step
-            if step is not None and step > session.steps and step > session.expected:
+            if step is not None and step > session.steps:  # another replica may have this state
                 raise session.wrong_step(step)
-
-            # An act that was queued before and then waited for a search keeps its episode.
-            before = pending.reserved
-            known = origin.sessions.get(session_id)
-            episode = before.episode if isinstance(before, ReservedAct) else known
-            if episode is None:
-                episode = _latest_episode(pending, session) if known is None else known
-            if known is None and origin.owner:
-                origin.sessions[session_id] = episode
-            if (episode if step is None else step) >= session.expected:
-                # An act of an older episode, which will be rejected, does not use the session.
-                session.origin = origin
 
             model = session.model  # another thread may set the attribute to None
             if model is not None:
                 model.check(request)
             if request.obs is not None and request.obs.info:
-                self._record_report(session, pending, request.obs.info)
-            session.plan.heard = pending.arrived
+                self._record_report(pending, request.obs.info)
             pending.waits_behind_others = session.plan.waits_behind_others
             if preparation is None and self._queue.window.overlaps:
                 preparation = self._prepare(session, request.obs)
-            return ReservedAct(session, model, episode, preparation)
+            return ReservedAct(session, model, preparation)
 
         if request.op == "reset":
             return self._open(pending)
-        if origin.owner and request.op == "adopt":
-            origin.sessions[session_id] = None
-        elif origin.owner and request.op not in _USE_NO_SESSION:
-            origin.sessions.setdefault(session_id, None)
+        if request.op == "close" and session_id not in self._sessions:
+            raise self._sessions.unknown(session_id)
         return None
 
-    def _record_report(
-        self, session: Session[LoadedModel], pending: PendingRequest, info: Mapping[str, Any]
-    ) -> None:
+    def _record_report(self, pending: PendingRequest, info: Mapping[str, Any]) -> None:
         """Read the slack of an act's robot, and its report, which is counted with the answer."""
         slack_s = stated_slack_s(info)
         if slack_s is not None:
             pending.needed = min(pending.arrived + slack_s, pending.deadline)
         report = RobotReport.of(info)
-        if report is None:
-            return
-        times = session.times
-        if times is None:
-            times = session.times = RobotTimes()
-        pending.message.reports[pending.index] = ReceivedReport(
-            report, times, pending.priority.name.lower(), self._stats, self._clock
-        )
+        if report is not None:
+            received = ReceivedReport(report, pending, self._stats, self._clock)
+            pending.message.reports[pending.index] = received
 
     def _open(self, pending: PendingRequest) -> Opening:
         """Check a reset, and reserve an episode of its session."""
-        request, origin, session_id = pending.request, pending.origin, pending.session_id
-        kwargs = dict(request.kwargs)
+        kwargs = dict(pending.request.kwargs)
         follows_newest = follows(kwargs, by_default=pending.priority is not Priority.ROBOT)
-        self._model.require_loaded().check(request)
-
-        session = self._sessions.open(session_id, origin)
-        first, previous = self._sessions.begin(session, request.step, pending.arrived, origin)
-        return Opening(kwargs, follows_newest, first, previous)
+        self._model.require_loaded().check(pending.request)
+        return self._sessions.reserve(pending, kwargs, follows_newest)
 
     def withdraw(self, *requests: PendingRequest) -> None:
         """End requests without an answer, as `BatchQueue.withdraw` does, and undo resets that
@@ -232,31 +209,35 @@ class Intake:
         self._queue.withdraw(*requests)
         for pending in requests:
             pending.drop_preparation()
-            self.undo(pending)
+            if not pending.begun:
+                self._undo(pending)
 
-    def undo(self, pending: PendingRequest) -> None:
-        """Undo the reservation of a reset that has not begun."""
-        opening = pending.reserved
-        if pending.begun or not isinstance(opening, Opening):
-            return
-        origin = pending.origin
-        self._sessions.undo(pending.session_id, opening.first, origin, opening.previous)
+    def _undo(self, pending: PendingRequest) -> None:
+        """Undo the reservation of a reset, unless the reset has been executed."""
+        if isinstance(pending.reserved, Opening):
+            self._sessions.undo(pending.session_id, pending.reserved)
 
     def fail(self, pending: PendingRequest, error: VLAgentsError) -> None:
-        """Finish a request with an error, and undo a reset that has not begun."""
-        self.undo(pending)
-        pending.fail(error)
+        """Finish a request with an error, and undo the reservation of a reset. A close succeeds if
+        no replica has its session.
+        """
+        self._undo(pending)
+        if pending.request.op == "close" and isinstance(error, UnknownSession):
+            pending.origin.sessions.pop(pending.session_id, None)
+            pending.finish(Reply(pending.request.request_id, info={}))
+        else:
+            pending.fail(error)
 
     def search(self, pending: PendingRequest, error: VLAgentsError) -> bool:
-        """Search for an act's session at other replicas, and queue the act again; return False if
-        there is no search.
+        """Search for the session of an act or a close at other replicas, and queue the request
+        again; return False if there is no search.
 
-        If the search does not find the session, the act fails with `error`.
+        If the search does not find the session, the request fails with `error`.
         """
         if (
             self._finder is None
             or pending.sought
-            or pending.request.op != "act"
+            or pending.request.op not in _SEARCHED
             or pending.is_abandoned
             or not isinstance(error, UnknownSession)
         ):
@@ -266,7 +247,7 @@ class Intake:
         origin = pending.origin
         searcher = origin.owner if origin.caller is None else origin.caller.name
         search = SessionSearch(self, pending, error)
-        if self._finder.fetch(pending.session_id, search.end, searcher, search.origin_for):
+        if self._finder.fetch(pending.session_id, search.end, searcher, search.use_of):
             return True
         if self._drain_list.draining:  # the replica has given its sessions to other replicas
             pending.fail(
@@ -278,9 +259,11 @@ class Intake:
         return False
 
     def retry(self, pending: PendingRequest) -> None:
-        """Queue an act again after a search for its session; raise an error if it is rejected."""
+        """Queue an act or a close again after a search for its session; raise an error if it is
+        rejected.
+        """
         # The session stays at the other replica if its key may hold no further session here.
-        if pending.session_id not in self._sessions:
+        if pending.request.op == "act" and pending.session_id not in self._sessions:
             self._sessions.require_allowed(pending.origin)
         pending.reserved = self.reserve(pending)
         self._queue.put(pending)
@@ -292,15 +275,15 @@ class Intake:
 
 
 class SessionSearch:
-    """A search of other replicas for the session of an act."""
+    """A search of other replicas for the session of an act or a close."""
 
     def __init__(self, intake: Intake, pending: PendingRequest, error: VLAgentsError) -> None:
         self._intake = intake
         self._pending = pending
-        self._error = error  # error of the act if its session is not found
+        self._error = error  # error of the request if its session is not found
 
     def end(self) -> None:
-        """Queue the act again, or finish it with its error, once the search has ended."""
+        """Queue the request again, or finish it with its error, once the search has ended."""
         pending = self._pending
         if pending.is_abandoned:
             pending.fail(self._error)
@@ -309,27 +292,17 @@ class SessionSearch:
             self._intake.retry(pending)
         except Exception as error:  # noqa: BLE001 - becomes the reply
             is_same = type(error) is type(self._error)
-            pending.fail(self._error if is_same else public_error(error, pending))
+            self._intake.fail(pending, self._error if is_same else public_error(error, pending))
 
-    def origin_for(self, state: SessionState, began: float) -> Origin | None:
-        """Return the origin of the act if the act can be executed on a session in the given state
-        at another replica. If not, return None, and the session stays there. `began` is the time at
+    def use_of(self, state: SessionState, began: float) -> SessionUse | None:
+        """Return the use of a session in the given state at another replica, if the request can be
+        executed on it. If not, return None, and the session stays there. `began` is the time at
         which the session's episode began, s.
         """
         pending = self._pending
-        if pending.is_abandoned:
+        if pending.is_abandoned or not pending.belongs_to(state.first, state.steps, began):
             return None
-        reserved = pending.reserved
-        episode = reserved.episode if isinstance(reserved, ReservedAct) else None
-        if not episode:
-            episode = pending.origin.sessions.get(pending.session_id)
-        if pending.request.step is not None:
-            fits = pending.request.step == state.steps
-        elif episode is not None:
-            fits = episode == state.first
-        else:
-            fits = began <= pending.latest_begin
-        return pending.origin if fits else None
+        return SessionUse(pending.origin, ends=pending.request.op == "close")
 
 
 def _take_stored(session: Session[LoadedModel], pending: PendingRequest) -> Preparation | None:
@@ -345,14 +318,3 @@ def _take_stored(session: Session[LoadedModel], pending: PendingRequest) -> Prep
     obs, preparation = stored
     pending.request = replace(pending.request, obs=obs)
     return preparation
-
-
-def _latest_episode(pending: PendingRequest, session: Session[LoadedModel]) -> int:
-    """Return the step at which the episode of an act began, if the act's connection has no episode.
-    The act then belongs to the latest episode of the session. An act without a step is rejected if
-    this episode began after the connection was opened. Over HTTP, it is rejected if the episode
-    began after the act arrived, while the act waited for a search for its session.
-    """
-    if pending.request.step is None and session.last_reset > pending.latest_begin:
-        raise session.wrong_episode()
-    return session.expected

@@ -73,8 +73,9 @@ class SessionMoves:
         `abandon`.
 
         `began` is the earliest time at which its episode may have begun, s, of this engine's clock.
-        From now on, the session counts for the key of `origin`. `weights` are the values of its
-        version of the weights, if this replica does not hold that version.
+        From now on, the session counts for the key of `origin`, the origin of the request that
+        needs it. `weights` are the values of its version of the weights, if this replica does not
+        hold that version.
         """
         self._health.require_ready()
         self._sessions.require_room([session_id])
@@ -84,15 +85,12 @@ class SessionMoves:
             session_id,
             steps=state.steps,
             first=first,
-            expected=first,
             began=began,
-            last_reset=began,
             moves=moves,
             announced=True,
-            origin=origin,
             plan=RobotPlan.from_list(state.robot, began, began + state.age_s),
         )
-        self._sessions.expect(arriving)
+        self._sessions.expect(arriving, origin)
         try:
             model = arriving.model = self._model.require_loaded()
             if tuple(state.policy) != model.version:

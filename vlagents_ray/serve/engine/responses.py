@@ -73,8 +73,7 @@ def build_reply(
     except Exception as error:  # noqa: BLE001 - becomes the reply
         return Reply(request_id, error=public_error(error, pending))
 
-    session.steps += 1
-    return Reply(request_id, act=act, step=session.steps)
+    return Reply(request_id, act=act, step=session.advance())
 
 
 def public_error(error: Exception, pending: PendingRequest) -> VLAgentsError:

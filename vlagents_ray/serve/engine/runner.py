@@ -242,7 +242,8 @@ class Runner:
                 raise
             logger.exception("the batch failed")
             for pending in taken.batch:
-                pending.fail(PolicyFailed(f"the policy raised {type(error).__name__}"))
+                failed = PolicyFailed(f"the policy raised {type(error).__name__}")
+                self._intake.fail(pending, failed)
         self._queue.end()
 
     def _run(self, batch: Sequence[PendingRequest]) -> None:
@@ -258,7 +259,7 @@ class Runner:
                     deliver([self._other(pending)])
             except Exception as error:  # noqa: BLE001 - becomes the reply
                 public = public_error(error, pending)
-                if pending.request.op == "act":
+                if pending.request.op in ("act", "close"):
                     self._queue.give_back([pending])
                     is_elsewhere = pending.session_id not in self._sessions
                     if is_elsewhere and self._intake.search(pending, public):
@@ -274,22 +275,18 @@ class Runner:
 
     def _reset(self, pending: PendingRequest, opening: Opening) -> Sequence[Answer]:
         """Begin the episode of a reset, and return the answer to the reset, if it is due now."""
-        session_id, request = pending.session_id, pending.request
-        if self._sessions.is_past(session_id, opening.first):
-            raise UnknownSession(
-                f"session {session_id!r}: reset elsewhere, or ended, while this reset waited"
-            )
-
-        session = self._sessions.open(session_id, pending.origin)
-        self._sessions.end_episode(session, pending, opening.first)
-        previous = session.model  # another thread may set the attribute to None
-        if previous is not None:
-            previous.parameters.end(session)
-        model = session.model = self._model.require_loaded()
+        request = pending.request
+        model = self._model.require_loaded()
         if request.obs is None:  # the decoder ensures that a reset has an observation
             raise PolicyFailed("reset: expected an observation, got none")
         model.check(request)
         check_options(unwrapped(model.agent), opening.kwargs)
+
+        session = self._sessions.begin(pending.session_id, opening)
+        previous = session.model  # another thread may set the attribute to None
+        if previous is not None:
+            previous.parameters.end(session)
+        session.model = model
 
         with model.busy, model.uncaptured, model.call("reset") as call:
             model.require_open()
@@ -316,13 +313,8 @@ class Runner:
         reply = Reply(request.request_id, info=info, step=session.steps, timing=spent)
         if session.announced or self._finder is None:
             return [(pending, reply)]
-        session.announced = True
-        # The session's acts arrive over the same connection, at this replica.
-        if pending.origin.owner:
-            self._finder.announce(session.id, session.steps)
-            return [(pending, reply)]
         # The next act may arrive at a replica that still has an older episode.
-        self._finder.announce(session.id, session.steps, (pending, reply))
+        self._finder.announce(session, (pending, reply))
         return ()
 
     def _other(self, pending: PendingRequest) -> Answer:
@@ -334,6 +326,8 @@ class Runner:
             info = self._moves.export(session_id, asked).info()
         elif request.op == "release":
             info = {"released": self._sessions.release(session_id, request.kwargs["version"])}
+        elif request.op == "raise_step":
+            info = {"step": self._sessions.raise_step(session_id, **request.kwargs)}
         elif request.op == "adopt":
             # The replica of this process uses the same session id again for sessions that it
             # compares.
@@ -343,13 +337,15 @@ class Runner:
             state = SessionState.from_info(request.kwargs)
             state = replace(state, weights=self._weights.acting())
             self._moves.adopt(session_id, state)
+            if pending.origin.owner:
+                pending.origin.sessions[session_id] = None
         elif request.op == "call":
             info = {"result": self._call(pending)}
             require_serializable(info, self._reply_bytes)
         elif request.op == "weights":
             self._weights.obey(**request.kwargs)
         else:
-            self._sessions.close(session_id, pending.origin)
+            self._sessions.close_for(pending)
         return pending, Reply(request.request_id, info=info)
 
     def _ready(
@@ -365,20 +361,14 @@ class Runner:
         else:
             session = reserved.session
         model, weights = session.model, session.weights
-        # An earlier reset in the queue failed.
-        if session.agent is None:
-            raise NotReset(f"session {pending.session_id!r}: its last reset failed; reset again")
-        step = pending.request.step
-        if step is not None and step != session.steps:
-            raise session.wrong_step(step)
-        episode = None if reserved is None else reserved.episode
-        if step is None and episode is not None and episode != session.first:
-            raise session.wrong_episode()
+        session.require_episode_of(pending)
         if model is None or weights is None:
             raise UnknownSession(f"session {pending.session_id!r}: has just been closed; reset it")
         # The session has arrived since the act was compared with the contract.
         if reserved is None or model is not reserved.model:
             model.check(pending.request)
+        self._sessions.use(session, pending.origin)
+        pending.executed_by = session
         return session, model, weights
 
     def _call(self, pending: PendingRequest) -> Any:

@@ -110,6 +110,10 @@ class Sender:
         """
         self._engine.sessions.require_room(session_ids, self._origin)
 
+    def discard(self, session_ids: Sequence[str]) -> None:
+        """Close the sessions that a message of the sender has begun in vain."""
+        self._engine.sessions.discard(session_ids, self._origin)
+
     def message(
         self, charge: Charge, op: str = "unknown", priority: str = "robot"
     ) -> IncomingMessage:
@@ -320,12 +324,10 @@ class Sender:
         case, for protocols that cannot request a reconnection.
         """
         self._origin.ended = True
-        owner = self._origin.owner
-        if owner and (
+        if self._origin.owner and (
             for_good or not (self._asked_to_reconnect or self._engine.drain_list.draining)
         ):
-            # The dict is copied, since a migrator's thread may add a session.
-            self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))
+            self._engine.sessions.close_owned(self._origin)
 
 
 def message_admission(

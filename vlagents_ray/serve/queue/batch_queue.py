@@ -222,6 +222,11 @@ class BatchQueue:
         """Return the number of requests of a priority that wait for the next batch."""
         return self._waiting.depth[priority]
 
+    def waiting_sessions(self) -> set[str]:
+        """Return the ids of the sessions whose requests wait for the next batch."""
+        with self._lock:
+            return {pending.session_id for pending in self._waiting.heads()}
+
     def depth_by_priority(self) -> dict[Priority, int]:
         """Return the number of requests that wait for the next batch, by priority."""
         return dict(zip(Priority, self._waiting.depth, strict=True))

@@ -22,7 +22,6 @@ from typing import Any
 
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.interface import SLACK
-from vlagents_ray.serve.queue.fair_queue import BEHIND_OTHERS_S
 from vlagents_ray.serve.queue.robots_load import (
     IDLE,
     USABLE,
@@ -56,7 +55,8 @@ class RobotPlan:
     """
 
     need: RobotNeed | None = None  # None until the need is known
-    heard: float = math.inf  # time at which the robot's last reset or act arrived, s; inf means now
+    # Time of the last answer to the robot's acts, or of the arrival of its reset, s; inf means now.
+    heard: float = math.inf
     # Time at which the robot's last answered act arrived, s; 0.0 before the first answer.
     asked: float = 0.0
     # Time at which the robot begins to execute the rows of its last answer, s. If its rows had run
@@ -82,12 +82,12 @@ class RobotPlan:
         """Whether the robot has sent its slack."""
         return self.need is not None or self.asked > 0
 
-    def is_present(self, now: float) -> bool:
-        """Return whether the robot has sent a request recently, at the time `now`, s."""
+    def is_present(self, now: float, *, waits: bool) -> bool:
+        """Return whether a request of the robot waits, or was answered recently, at the time `now`,
+        s.
+        """
         rows_s = 0.0 if self.need is None else self.need.longest_s
-        has_request = self.heard > self.asked  # which is not answered yet
-        waits_s = BEHIND_OTHERS_S if self.waits_behind_others and has_request else 0.0
-        return now - self.heard <= _PRESENT_S + rows_s + waits_s
+        return waits or now - self.heard <= _PRESENT_S + rows_s
 
     def observe(self, rows: int, arrived: float, needed: float, now: float) -> None:
         """Update the needs of the robot from an act.
@@ -100,6 +100,7 @@ class RobotPlan:
             now: The time at which the act is answered, s.
         """
         asked, self.asked = self.asked, arrived
+        self.heard = now
         began = self.begins
         # The robot skips one row for each action that it executed while it waited.
         self.begins = now - min(now - arrived, max(0.0, needed - arrived))
@@ -142,7 +143,7 @@ class ReplicaPace:
 
     Args:
         curve: Returns the measured durations of batches; None before the first batch.
-        plans: Returns the plan of each session.
+        plans: Returns the plan of each session, and whether a request of the session waits.
         max_batch_size: The largest batch.
         clock: The engine's clock, s.
         depth: Returns the number of requests that wait.
@@ -151,7 +152,7 @@ class ReplicaPace:
     def __init__(
         self,
         curve: Callable[[], CostCurve | None],
-        plans: Callable[[], Iterable[RobotPlan]],
+        plans: Callable[[], Iterable[tuple[RobotPlan, bool]]],
         max_batch_size: int,
         clock: Callable[[], float],
         depth: Callable[[], int],
@@ -228,8 +229,8 @@ class ReplicaPace:
         """
         now = self._clock()
         plans: list[RobotPlan] = []
-        for plan in self._plans():
-            if plan.sends_slack and plan.is_present(now):
+        for plan, waits in self._plans():
+            if plan.sends_slack and plan.is_present(now, waits=waits):
                 plans.append(plan)
             else:
                 plan.waits_behind_others = False

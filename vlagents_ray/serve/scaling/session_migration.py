@@ -29,23 +29,24 @@ from abc import ABC, abstractmethod
 from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.protocol.messages import Op, Request
+from vlagents_ray.errors import UnknownSession, VLAgentsError
+from vlagents_ray.protocol.messages import Op, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import WaitingTask
 from vlagents_ray.serve.models.loaded_model import LoadedModel
-from vlagents_ray.serve.requests import (
-    NOWHERE,
-    Answer,
-    IncomingMessage,
-    Origin,
-    PendingRequest,
-    deliver,
+from vlagents_ray.serve.requests import Answer, IncomingMessage, Origin, PendingRequest, deliver
+from vlagents_ray.serve.sessions import (
+    Outdated,
+    Past,
+    Session,
+    SessionState,
+    SessionUse,
+    Version,
 )
-from vlagents_ray.serve.sessions import Outdated, Session, SessionState, Version
 from vlagents_ray.serve.weights import VersionNotHeld
 
 logger = logging.getLogger(__name__)
@@ -62,7 +63,7 @@ InThread = Callable[..., Awaitable[Any]]
 Spawn = Callable[[Coroutine[Any, Any, Any]], "asyncio.Task[Any]"]
 # Fetches a session from the replica with the given name.
 FetchFrom = Callable[[str, str], Awaitable[bool]]
-UserOf = Callable[[SessionState, float], Origin | None]
+UserOf = Callable[[SessionState, float], SessionUse | None]
 # The function to call when a search is over, and the argument `user` of `fetch`.
 _Callback = tuple[Callable[[], None], UserOf]
 # Largest number of concurrent searches of a caller. Further requests get `UnknownSession`.
@@ -204,9 +205,22 @@ class HeldSessions:
             logger.info("session %s: not taken over: %s", session_id, error)
             return False
 
-    async def drop_older(self, steps: dict[str, int]) -> None:
-        """Close the sessions that have begun an episode at another replica, at the given steps."""
-        self._engine.sessions.drop_older(steps)
+    async def drop_older(self, episodes: dict[str, Episode]) -> dict[str, Episode]:
+        """Close the sessions that have begun the given episodes at another replica.
+
+        Returns:
+            The episodes that contradict the order of steps, see `SessionTable.drop_older`.
+        """
+        now = self._engine.clock()
+        begun = {
+            session_id: Past((step, 0), now - age_s)
+            for session_id, (step, age_s) in episodes.items()
+        }
+        contradicting = self._engine.sessions.drop_older(begun)
+        return {
+            session_id: (past.version[0], now - past.began)
+            for session_id, past in contradicting.items()
+        }
 
     # Operations that this replica calls.
 
@@ -232,6 +246,13 @@ class HeldSessions:
                     )
         finally:
             self._leaving.pop(session_id).set_result(None)
+
+    async def raise_step(self, session_id: str, first: int, above: int) -> int | None:
+        """Raise the first step of an episode that this replica has begun, see
+        `SessionTable.raise_step`.
+        """
+        info = await self._ask(session_id, "raise_step", EXPORT_S, first=first, above=above)
+        return None if info is None else info["step"]
 
     async def wait_until_left(self, session_id: str) -> None:
         """Wait until another replica has the session, if this replica is transferring it."""
@@ -281,6 +302,34 @@ class Peer(ABC):
 
 
 Peers = Callable[[], Awaitable[Sequence[Peer]]]
+# Step of an episode, and time since its reset arrived, s. The clocks of replicas differ.
+Episode = tuple[int, float]
+
+
+@dataclass(slots=True)
+class _Announcement:
+    """An episode that this replica has begun, and announces to the other replicas."""
+
+    session: Session[Any]
+    step: int  # step at which the episode begins
+    began: float  # time at which its reset arrived, s, of the engine's clock
+    answer: Answer  # the answer to the reset, which is delivered after the announcement
+
+    def finish(self) -> None:
+        """Deliver the answer, after the announcement."""
+        if self.session.first == self.step:  # it has begun no other episode meanwhile
+            self.session.announced = True
+        deliver([self.answer])
+
+    def fail(self) -> None:
+        """Replace the answer by an error, since another replica has begun an episode later."""
+        pending, _ = self.answer
+        error = UnknownSession(
+            f"session {pending.session_id!r}: reset elsewhere while this reset was executed"
+        )
+        self.answer = (pending, Reply(pending.request.request_id, error=error))
+
+
 # Each replica's answer with the sessions it holds.
 _Answers = dict[Peer, "asyncio.Task[dict[str, Version] | None]"]
 
@@ -319,10 +368,8 @@ class SessionMigrator:
         self._callbacks: dict[str, list[_Callback]] = {}
         self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next query
         self._callers: Counter[str] = Counter()  # number of running searches by caller
-        # Steps at which episodes began that are not announced yet, by session.
-        self._unannounced: dict[str, int] = {}
-        # Answers that are delivered once these steps are announced.
-        self._announced: list[Answer] = []
+        # Episodes that are not announced yet.
+        self._unannounced: list[tuple[str, _Announcement]] = []
         # Number of sessions that are being fetched because other replicas offered them.
         self._offered = 0
         # Time until which a silent replica gets no request, s, by the replica's name.
@@ -341,18 +388,19 @@ class SessionMigrator:
         session_id: str,
         then: Callable[[], None],
         caller: str = "",
-        user: UserOf = lambda *_: NOWHERE,
+        user: UserOf = lambda *_: SessionUse(),
     ) -> bool:
-        """Fetch a session from another replica.
+        """Fetch a session from another replica, or close it there.
 
         Args:
             session_id: The session.
-            then: Called once this replica has the session, or the session was not found.
+            then: Called once this replica has the session, or the session was not found or closed.
             caller: The owner of the search. The number of concurrent searches per caller is
                 limited.
-            user: Returns the origin of a request that can act on a session with the given exported
-                state, whose episode began at the given time; None if the request cannot. A session
-                is not moved if all waiting requests return None.
+            user: Returns the use that a request makes of a session with the given exported state,
+                whose episode began at the given time; None if the request cannot use it. A session
+                is not moved if all waiting requests return None, and is closed at its replica if
+                they only close it.
 
         Returns:
             False if `then` will not be called, since `caller` has too many searches or the migrator
@@ -378,21 +426,19 @@ class SessionMigrator:
         self._loop.call_soon_threadsafe(lambda: self._spawn(self._search(session_id)))
         return True
 
-    def announce(self, session_id: str, step: int, answer: Answer | None = None) -> None:
+    def announce(self, session: Session[Any], answer: Answer) -> None:
         """Announce to the other replicas that the session has begun an episode at this replica, so
         that they drop older states.
 
         Args:
-            session_id: The session.
-            step: The step at which the episode began.
+            session: The session; called on the policy's thread.
             answer: The answer to the reset. It is delivered once the other replicas have dropped
                 those states, or after `_OTHERS_S`.
         """
+        announcement = _Announcement(session, session.first, session.began, answer)
         with self._lock:
             is_first = not self._unannounced
-            self._unannounced[session_id] = step
-            if answer is not None:
-                self._announced.append(answer)
+            self._unannounced.append((session.id, announcement))
         if not is_first:
             return
         self._loop.call_soon_threadsafe(lambda: self._spawn(self._announce_all()))
@@ -483,8 +529,9 @@ class SessionMigrator:
             for version, peer in holders[1:]:
                 newest = holders[0][0]
                 if version < newest:
-                    newest_step = newest[0]
-                    dropping = peer.ask(HeldSessions.drop_older, {session_id: newest_step})
+                    # The age of the newest episode is unknown here. With age 0, no later episode is
+                    # raised above it.
+                    dropping = peer.ask(HeldSessions.drop_older, {session_id: (newest[0], 0.0)})
                     self._spawn(self._answer(dropping))
 
             if holders and await self._move(session_id, holders[0][1]):
@@ -520,11 +567,13 @@ class SessionMigrator:
         # beginning of the episode. An act that arrived after the reset is therefore never mistaken
         # for an act of an older episode.
         began = asked - state.age_s
-        origin = NOWHERE if is_leaving else self._user_of(session_id, state, began)
-        if origin is None:
+        use = SessionUse() if is_leaving else self._use_of(session_id, state, began)
+        if use is None:
             return True
 
-        arriving = await self._prepare(peer, session_id, state, began, origin)
+        arriving = None
+        if not use.ends:
+            arriving = await self._prepare(peer, session_id, state, began, use.origin)
         claim = uuid.uuid4().hex
         release = self._spawn(
             self._answer(peer.ask(HeldSessions.release, session_id, state.version, claim))
@@ -534,8 +583,12 @@ class SessionMigrator:
             if await self._query_peer(peer, []) is None:
                 self._finish(session_id)
         if not release.result():
-            self._engine.moves.abandon(arriving)
+            if arriving is not None:
+                self._engine.moves.abandon(arriving)
             return False
+        if arriving is None:
+            self._engine.sessions.end_elsewhere(session_id, state.version, began)
+            return True
 
         self._engine.moves.enter(arriving)
         logger.info(
@@ -573,14 +626,14 @@ class SessionMigrator:
                     raise
             return await prepare(weights)
 
-    def _user_of(self, session_id: str, state: SessionState, began: float) -> Origin | None:
-        """Return the origin of a waiting request that can act on the session; None if there is
-        no such request.
+    def _use_of(self, session_id: str, state: SessionState, began: float) -> SessionUse | None:
+        """Return the use of the session by a waiting request, by an act rather than a close; None
+        if no request can use it.
         """
         with self._lock:
             callbacks = list(self._callbacks.get(session_id, ()))
-        origins = (user(state, began) for _, user in callbacks)
-        return next((origin for origin in origins if origin is not None), None)
+        uses = [use for _, user in callbacks if (use := user(state, began)) is not None]
+        return min(uses, key=lambda use: use.ends, default=None)
 
     def _answers(self, session_id: str) -> asyncio.Future[_Answers]:
         """Return a future for the other replicas' answers to the next query, which is about all
@@ -650,29 +703,68 @@ class SessionMigrator:
             return None
 
     async def _announce_all(self) -> None:
-        announced: list[Answer] | None = None
+        announced: list[tuple[str, _Announcement]] | None = None
         try:
             peers = [] if self._closed else await self._peers()
             if peers:
                 await asyncio.sleep(_GATHER_S)
-            begun, announced = self._take_unannounced()
+            announced = self._take_unannounced()
             if peers:
-                answers = [
-                    self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun)))
-                    for peer in peers
-                ]
-                await asyncio.wait(answers, timeout=_OTHERS_S)
+                raised = await self._announce_to(peers, dict(announced))
+                if raised:
+                    await self._announce_to(peers, raised)
         finally:  # also if the task is cancelled because the replica stops
-            deliver(self._take_unannounced()[1] if announced is None else announced)
+            announced = self._take_unannounced() if announced is None else announced
+            for _, announcement in announced:
+                announcement.finish()
 
-    def _take_unannounced(self) -> tuple[dict[str, int], list[Answer]]:
-        """Return the steps at which episodes began, by session, and the answers that are due once
-        these steps are announced.
+    async def _announce_to(
+        self, peers: Sequence[Peer], episodes: dict[str, _Announcement]
+    ) -> dict[str, _Announcement]:
+        """Announce episodes to the other replicas, and wait for their answers for `_OTHERS_S`.
+
+        A replica whose clock is ahead may have an earlier episode at a greater step, above which
+        the step of the announced episode is then raised. If the other replica has a later episode,
+        the announced one is void.
+
+        Returns:
+            The episodes whose steps were raised, so that they must be announced again.
         """
+        asked = self._engine.clock()
+        begun = {
+            session_id: (episode.step, asked - episode.began)
+            for session_id, episode in episodes.items()
+        }
+        calls = [self._answer(peer.ask(HeldSessions.drop_older, begun)) for peer in peers]
+        tasks = [self._spawn(call) for call in calls]
+        answered, _ = await asyncio.wait(tasks, timeout=_OTHERS_S)
+
+        now = self._engine.clock()
+        greater: dict[str, int] = {}
+        for task in answered:
+            for session_id, (step, age_s) in (task.result() or {}).items():
+                episode = episodes[session_id]
+                # The answer was sent between `asked` and `now`.
+                if now - age_s < episode.began:
+                    greater[session_id] = max(step, greater.get(session_id, 0))
+                elif asked - age_s > episode.began:
+                    self._engine.sessions.void(session_id, episode.step, (step, 0))
+                    episode.fail()
+
+        raised: dict[str, _Announcement] = {}
+        for session_id, above in greater.items():
+            episode = episodes[session_id]
+            step = await self.sessions.raise_step(session_id, episode.step, above)
+            if step is not None:
+                episode.step = episode.answer[1].step = step
+                raised[session_id] = episode
+        return raised
+
+    def _take_unannounced(self) -> list[tuple[str, _Announcement]]:
+        """Return the episodes that are not announced yet, by session."""
         with self._lock:
-            begun, self._unannounced = self._unannounced, {}
-            announced, self._announced = self._announced, []
-        return begun, announced
+            announced, self._unannounced = self._unannounced, []
+        return announced
 
     def _finish(self, session_id: str, waiting: Collection[_Callback] | None = None) -> bool:
         """Call the callbacks of a session whose search is over; if the session was not found, call
