@@ -129,7 +129,6 @@ class PendingRequest:
     # First step of the episode of the connection when the request arrived; None without a
     # connection, or if the connection has not used the session.
     episode: int | None = None
-    executed_by: Any = None  # the `Session` that has executed an act
     # Recent time from an answer to the session's next request, s; None if it is unknown.
     return_s: float | None = None
     index: int = 0  # index of the request in its message
@@ -227,6 +226,8 @@ def deliver(answers: Iterable[Answer]) -> None:
 
 class UncountedReport(Protocol):
     """A robot's report in a request that is not answered yet."""
+
+    session: Any  # the `Session` that has executed the request; None before
 
     def count(self) -> None:
         """Add the report to the figures of its session and of the replica."""

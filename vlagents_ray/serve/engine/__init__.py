@@ -20,10 +20,6 @@ PendingRequest.reserved, .episode, .sought
     writers: the thread that reserves for the request
     protection: only one thread at a time reserves for, searches for or queues a request
 
-PendingRequest.executed_by
-    writers: policy
-    protection: one writer
-
 Origin.sessions: episodes
     writers: policy
     protection: one writer; changes lock SessionTable, except those of inner operations

@@ -46,20 +46,21 @@ from vlagents_ray.serve.weights import follows
 _SEARCHED = ("act", "close")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ReceivedReport:
     """The report of a robot in a request that is not answered yet."""
 
     report: RobotReport
-    pending: PendingRequest
+    priority: str
     stats: MetricsBuffer
     clock: Callable[[], float]
+    session: Session[Any] | None = None  # the session that has executed the request
 
     def count(self) -> None:
         """Add the report to the metrics, and to the session if it has executed the request."""
-        self.stats.report(self.pending.priority.name.lower(), self.report)
-        if self.pending.executed_by is not None:
-            self.pending.executed_by.add_report(self.report, self.clock())
+        self.stats.report(self.priority, self.report)
+        if self.session is not None:
+            self.session.add_report(self.report, self.clock())
 
 
 class Intake:
@@ -192,8 +193,9 @@ class Intake:
             pending.needed = min(pending.arrived + slack_s, pending.deadline)
         report = RobotReport.of(info)
         if report is not None:
-            received = ReceivedReport(report, pending, self._stats, self._clock)
-            pending.message.reports[pending.index] = received
+            pending.message.reports[pending.index] = ReceivedReport(
+                report, pending.priority.name.lower(), self._stats, self._clock
+            )
 
     def _open(self, pending: PendingRequest) -> Opening:
         """Check a reset, and reserve an episode of its session."""
@@ -224,6 +226,7 @@ class Intake:
         self._undo(pending)
         if pending.request.op == "close" and isinstance(error, UnknownSession):
             pending.origin.sessions.pop(pending.session_id, None)
+            error.__traceback__ = None  # its frames would keep the message in memory
             pending.finish(Reply(pending.request.request_id, info={}))
         else:
             pending.fail(error)

@@ -368,7 +368,8 @@ class Runner:
         if reserved is None or model is not reserved.model:
             model.check(pending.request)
         self._sessions.use(session, pending.origin)
-        pending.executed_by = session
+        if pending.message.reports and pending.index in pending.message.reports:
+            pending.message.reports[pending.index].session = session
         return session, model, weights
 
     def _call(self, pending: PendingRequest) -> Any:
