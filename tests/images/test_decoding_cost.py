@@ -128,7 +128,7 @@ LARGE = {
     "PNG of one column": PngRecipe(2**20, 1, filters=(4,)).file,
     "PNG of one row": PngRecipe(1, 2**20).file,
     "PNG with a palette": PngRecipe(1024, 1024, colour=3).file,
-    "JPEG of one column": JpegRecipe(65_500, 1, sampling=(0x44, 0x11, 0x11)).file,
+    "JPEG of one row": JpegRecipe(1, 65_500, sampling=(0x41, 0x11, 0x11)).file,
     "JPEG of four components": JpegRecipe(1024, 1024, sampling=(0x11,) * 4).file,
 }
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Sequence
+import zlib
 from dataclasses import dataclass
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, UnsupportedImage
@@ -24,6 +24,7 @@ PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER = struct.Struct(">2I5B")
 # Header fields after the size, for an RGB image of 8 bits without interlacing.
 RGB8 = (8, 2, 0, 0, 0)
+UP = 2  # the filter of all rows that `encode_png` writes
 
 # The largest number of segments before the scan of a JPEG. Encoders write about ten, and the
 # programs that edit photographs some more.
@@ -44,9 +45,11 @@ _PNG_FILE_S = 500e-6
 _PNG_ROW_S = 0.1e-6  # per row
 _PNG_S = 12e-9  # per byte of the unpacked rows
 _PNG_BYTE_S = 5e-9  # per byte of the file
+# Bytes of a PNG's data that are unpacked to find the filter of its first row.
+_PEEKED_BYTES = 512
 # The memory that Pillow needs in addition to the result, bytes per pixel: the image in 32 bits, and
 # copies of the unpacked rows.
-_PILLOW_PIXEL_BYTES = 20
+_PILLOW_PIXEL_BYTES = 16
 
 _BASELINE, _SOS, _EOI = 0xC0, 0xDA, 0xD9
 _SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of the headers of all processes
@@ -54,6 +57,7 @@ _PROCESSES = {0xC1: "extended", 0xC2: "progressive", 0xC9: "arithmetic", 0xCA: "
 _FILL = re.compile(b"\xff+")  # fill bytes, any number of which may precede a marker
 # The first marker after the data of a scan: neither a byte 0xFF of the data nor a restart.
 _END_OF_SCAN = re.compile(b"\xff[^\x00\xff\xd0-\xd7]")
+_RGB = 2  # PNG colour type
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # PNG colour type -> number of channels
 _CRITICAL = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
 
@@ -242,7 +246,8 @@ def _read_png(file: bytes, max_pixels: int) -> ImageFile:
         )
 
     seconds = _PNG_FILE_S + rows_bytes * _PNG_S + height * _PNG_ROW_S + len(file) * _PNG_BYTE_S
-    if is_own_png(file, chunks):
+    start = chunks[first][1] + 8
+    if colour == _RGB and _first_filter(memoryview(file)[start : start + _PEEKED_BYTES]) == UP:
         scratch = 2 * rows_bytes
     else:
         scratch = _PILLOW_PIXEL_BYTES * height * (width + 1)
@@ -266,13 +271,14 @@ def _png_chunks(file: bytes) -> list[tuple[bytes, int, int]]:
     raise MessageTooLarge("image: a PNG with too many chunks; encode it again")
 
 
-def is_own_png(file: bytes, chunks: Sequence[tuple[bytes, int, int]]) -> bool:
-    """Return whether a PNG has exactly the chunks that `encode_png` writes."""
-    header_end, data_start = chunks[0][2], chunks[1][1]
-    is_whole = len(chunks) == 3 and header_end == data_start and chunks[2][2] == len(file)
-    return (
-        is_whole and chunks[1][2] == chunks[2][1] and PNG_HEADER.unpack_from(file, 16)[2:] == RGB8
-    )
+def _first_filter(data: memoryview) -> int:
+    """Return the filter of the first row, given the beginning of a PNG's data; -1 if it is
+    unknown.
+    """
+    try:
+        return (zlib.decompressobj().decompress(data, 1) or b"\xff")[0]
+    except zlib.error:
+        return -1
 
 
 def _check_size(

@@ -32,13 +32,12 @@ from vlagents_ray.images.image_file import (
     PNG_HEADER,
     PNG_MAGIC,
     RGB8,
+    UP,
     ImageFile,
     read_structure,
 )
 
 MAX_PIXELS = 4096 * 4096  # default limit for one image
-_UP = 2
-
 # A PNG is unpacked in at most this number of slices, of at least this size in bytes. Each slice
 # waits for Python's global lock.
 _SLICES, _SLICE_BYTES = 32, 4096
@@ -66,14 +65,19 @@ def encode_png(image: np.ndarray) -> bytes:
     height, width, _ = image.shape
     pixels = np.ascontiguousarray(image).reshape(height, width * 3)
     rows = np.empty((height, 1 + width * 3), np.uint8)
-    rows[:, 0] = _UP
+    rows[:, 0] = UP
     rows[:1, 1:] = pixels[:1]
     np.subtract(pixels[1:], pixels[:-1], out=rows[1:, 1:])
     deflate = zlib.compressobj(1, zlib.DEFLATED, 15, 9, zlib.Z_RLE)
     data = deflate.compress(rows.data) + deflate.flush()
     header = PNG_HEADER.pack(width, height, *RGB8)
     return b"".join(
-        (PNG_MAGIC, _chunk(b"IHDR", header), _chunk(b"IDAT", data), _chunk(b"IEND", b""))
+        [
+            PNG_MAGIC,
+            *_chunk_parts(b"IHDR", header),
+            *_chunk_parts(b"IDAT", data),
+            *_chunk_parts(b"IEND", b""),
+        ]
     )
 
 
@@ -117,9 +121,11 @@ def _decode_png(file: ImageFile) -> np.ndarray:
     height, width = file.height, file.width
     data = _inflate(file)
     rows = np.frombuffer(data, np.uint8).reshape(height, file.row_bytes)
-    if file.channels == 3 and not (rows[:, 0] != _UP).any():
+    if file.channels == 3 and not (rows[:, 0] != UP).any():
         return np.add.accumulate(rows[:, 1:], axis=0, dtype=np.uint8).reshape(height, width, 3)
-    return _decode_rows(file, data)
+    stored = zlib.compress(data, 0)
+    del rows, data  # so that at most two copies exist
+    return _decode_with_pillow(file, stored)
 
 
 def _inflate(file: ImageFile) -> bytes:
@@ -166,12 +172,11 @@ def _slices(file: ImageFile) -> Iterator[memoryview]:
                 yield data[at : min(at + slice_bytes, end - 4)]
 
 
-def _decode_rows(file: ImageFile, rows: bytes) -> np.ndarray:
-    """Decode the unpacked rows of a PNG with Pillow.
+def _decode_with_pillow(file: ImageFile, stored: bytes) -> np.ndarray:
+    """Decode a PNG with Pillow, whose rows are `stored` in the format of zlib without compression.
 
-    Pillow receives a file with only the chunks that the pixels need, in which the rows are stored
-    without compression. It would read all other chunks in Python, and raises its own kinds of
-    errors for some invalid ones.
+    Pillow receives a file with only the chunks that the pixels need. It would read all other chunks
+    in Python, and raises its own kinds of errors for some invalid ones.
     """
     try:
         from PIL import Image
@@ -180,9 +185,8 @@ def _decode_rows(file: ImageFile, rows: bytes) -> np.ndarray:
 
         raise MissingDependency(f"PNG images need Pillow; {pip_install('serve')}") from error
     head = [file.data[start:end] for name, start, end in file.chunks if name in (b"IHDR", b"PLTE")]
-    data = b"".join(
-        [PNG_MAGIC, *head, _chunk(b"IDAT", zlib.compress(rows, 0)), _chunk(b"IEND", b"")]
-    )
+    data = b"".join([PNG_MAGIC, *head, *_chunk_parts(b"IDAT", stored), *_chunk_parts(b"IEND", b"")])
+    del stored
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -194,10 +198,10 @@ def _decode_rows(file: ImageFile, rows: bytes) -> np.ndarray:
         raise MalformedMessage(f"image: broken PNG ({error})") from error
 
 
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    """Return a chunk of a PNG file."""
+def _chunk_parts(kind: bytes, data: bytes) -> tuple[bytes, bytes, bytes, bytes]:
+    """Return the parts of a chunk of a PNG file."""
     checksum = zlib.crc32(data, zlib.crc32(kind))
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", checksum)
+    return struct.pack(">I", len(data)), kind, data, struct.pack(">I", checksum)
 
 
 def data_url(kind: str, data: bytes) -> str:
