@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import io
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 
 import hostile_images
 import numpy as np
 import pytest
+import simplejpeg
 from camera_images import rendered
 from hostile_images import JPEG_CHOICES, PNG_CHOICES, JpegRecipe, PngRecipe
 from PIL import Image, ImageFile
@@ -219,6 +221,36 @@ def test_a_client_that_rewrites_its_memory_meanwhile_changes_nothing(
     [image] = decode_files([memoryview(memory)], Budget(DEFAULT_LIMITS))
     assert image.shape == rendered().shape
     assert not any(memory)
+
+
+@pytest.mark.parametrize("sampling", ["444", "422", "440", "420", "411", "Gray"])
+def test_jpegs_of_simplejpeg_are_decoded(sampling: str) -> None:
+    """vlagents' clients and cameras' drivers use it."""
+    file = simplejpeg.encode_jpeg(rendered(), colorsubsampling=sampling)
+    assert jpeg_png.decode(file).shape == (224, 224, 3)
+
+
+@pytest.mark.parametrize("kind", [".jpg", ".png"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_files_of_opencv_are_decoded(kind: str, channels: int) -> None:
+    """GR00T's, XPolicyLab's and LeRobot's clients use it."""
+    cv2 = pytest.importorskip("cv2")
+    image = np.dstack([rendered(), rendered()])[:, :, :channels]
+    options = [cv2.IMWRITE_JPEG_RST_INTERVAL, 4, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    for chosen in ([], options if kind == ".jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 9]):
+        file = cv2.imencode(kind, image, chosen)[1].tobytes()
+        assert jpeg_png.decode(file).shape == (224, 224, 3)
+
+
+@pytest.mark.parametrize(("codec", "form"), [("mjpeg", "yuvj420p"), ("png", "rgb24")])
+def test_files_of_ffmpeg_are_decoded(codec: str, form: str) -> None:
+    av = pytest.importorskip("av")
+    encoder = av.CodecContext.create(codec, "w")
+    encoder.width = encoder.height = 224
+    encoder.pix_fmt, encoder.time_base = form, Fraction(1, 30)
+    frame = av.VideoFrame.from_ndarray(rendered(), format="rgb24").reformat(format=form)
+    packets = [*encoder.encode(frame), *encoder.encode(None)]
+    assert jpeg_png.decode(b"".join(map(bytes, packets))).shape == (224, 224, 3)
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "P", "RGB", "RGBA"])
