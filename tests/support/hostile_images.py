@@ -4,7 +4,7 @@ for them.
 A `PngRecipe` or a `JpegRecipe` describes a file by the choices of its encoder: blocks and Huffman
 tables of the compressed data, filters, depth, interlacing, scans, segments, sampling. The search
 changes recipes at random, and continues with those whose files are accepted and take the most CPU
-time relative to their estimate. Nobody has to know the worst file.
+time relative to their estimate, so no list of known files is needed.
 """
 
 from __future__ import annotations

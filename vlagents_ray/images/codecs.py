@@ -136,6 +136,7 @@ def decode_files(
             message = str(error).removeprefix("image: ")
             raise type(error)(f"camera {names[index][:40]!r}: {message}") from error.__cause__
 
+    budget.examine(sum(map(len, files)))
     begun = time.thread_time()
     read = partial(read_structure, max_pixels=budget.limits.pixels)
     checked = [attributed(read, file, index) for index, file in enumerate(files)]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from eval_fakes import wait_for
 from frozen_rates import freeze, requests_charged
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -18,7 +19,7 @@ from in_memory_keys import ChangingKeys
 from PIL import Image
 
 from vlagents_ray.errors import TooManyRequests, UnsupportedImage
-from vlagents_ray.images import jpeg_png
+from vlagents_ray.images import codecs, jpeg_png
 from vlagents_ray.images.image_file import ImageFile
 from vlagents_ray.protocol import frame_layout
 from vlagents_ray.protocol.frames import Decoded, decode_requests
@@ -112,6 +113,25 @@ def test_the_images_of_a_message_in_place_are_a_quarter_megapixel_together(
     assert [thread for _, thread in decoded] == [here] * number + ["decode-robots"]
 
 
+def test_large_files_are_checked_and_decoded_elsewhere(
+    decoded: list[tuple[int, str]], whole: Admission, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Finding the end of the scan of a JPEG of 10 MB takes 4 ms."""
+    checked: list[str] = []
+    original = codecs.read_structure
+
+    def check(file: bytes, max_pixels: int) -> ImageFile:
+        checked.append(threading.current_thread().name.rpartition("_")[0])
+        return original(file, max_pixels)
+
+    monkeypatch.setattr(codecs, "read_structure", check)
+    noise = np.random.default_rng(0).integers(0, 256, (700, 700, 3), np.uint8)
+    monkeypatch.setitem(FILES, "noise", jpeg_png.encode_jpeg(noise, 100))
+    assert len(FILES["noise"]) > INLINE_BYTES
+    decode_anywhere(message(whole), frame("noise"))
+    assert checked == ["decode-robots"]
+
+
 @pytest.mark.slow
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(
@@ -180,6 +200,30 @@ def test_the_end_of_a_replica_cancels_a_message_that_waits(whole: Admission) -> 
     whole.close()
     go_on.set()
     assert waiting.cancelled()
+
+
+@pytest.mark.parametrize("is_long", [False, True])
+def test_a_client_that_leaves_cancels_its_message_wherever_it_waits(
+    whole: Admission,
+    decoded: list[tuple[int, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    is_long: bool,
+) -> None:
+    monkeypatch.setattr(admission_module, "LONG_S", 0.0 if is_long else 1.0)
+    go_on = threading.Event()
+    blocked = [whole.submit(lambda: go_on.wait(30), robot=not is_long) for _ in range(16)]
+    admission = message(whole)
+    waiting = admission.decode_on_thread(partial(decode_requests, frame("large")))
+    if is_long:  # the thread for robots has moved it to the others
+        wait_for(lambda: not admission._is_short)
+    assert waiting.cancel()
+    go_on.set()
+    for job in blocked:
+        job.result(30)
+    whole.submit(lambda: None, not is_long).result(30)
+    assert not decoded
+    admission.release()
+    assert whole.held == 0
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.5, 1.0, 1.5, 30.0])

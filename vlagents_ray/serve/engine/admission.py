@@ -41,8 +41,8 @@ from vlagents_ray.serve.access.charges import Charge
 
 T = TypeVar("T")
 
-# Limits above which another thread decodes: the decoded bytes of a quarter of a megapixel, and the
-# time in which one core decodes such a JPEG of the highest quality.
+# Limits above which another thread decodes: the bytes of a quarter of a megapixel, of the files and
+# decoded, and the time in which one core decodes such a JPEG of the highest quality.
 INLINE_BYTES = 3 * 2**18
 INLINE_S = 4e-3
 # The time above which a robot's message is not decoded on the threads for robots, s, so that other
@@ -324,6 +324,7 @@ class MessageAdmission(Budget):
         "_admission",
         "_decoded",
         "_decoding_s",
+        "_examined",
         "_held",
         "_images",
         "_images_used",
@@ -374,6 +375,7 @@ class MessageAdmission(Budget):
         self._decoding_s = 0.0  # estimated time of decoding the images so far, s
         self._requests = 0  # number of requests so far that are charged
         self._inline = inline
+        self._examined = 0  # bytes of image files so far
         # Whether a thread for robots decodes the message, so that a long message is decoded
         # elsewhere.
         self._is_short = False
@@ -460,6 +462,14 @@ class MessageAdmission(Budget):
                 self._admission.release(scratch_bytes, self._key)
                 self._held -= scratch_bytes
 
+    def examine(self, size: int) -> None:
+        """Count bytes of image files, as in `Budget`; raise `NeedsDecodingThread` if the check of
+        their structure takes too long here.
+        """
+        self._examined += size
+        if self._inline and self._examined > INLINE_BYTES:
+            raise NeedsDecodingThread
+
     def spend(self, seconds: float) -> None:
         """Charge the CPU time of decoding to the key, as in `Budget`."""
         self.charge.spend(seconds)
@@ -500,24 +510,24 @@ class MessageAdmission(Budget):
             return job
 
         done: Future[T] = Future()
+        jobs = [job]  # the attempts to decode the message
+        done.add_done_callback(lambda _: jobs[-1].cancel())
 
         def finish(job: Future[T]) -> None:
             """Return the result, or decode a long message on the threads for others."""
-            if job.cancelled():
-                done.cancel()
-                done.set_running_or_notify_cancel()
-                return
-            error = job.exception()
-            if isinstance(error, NeedsDecodingThread):
+            error = None if job.cancelled() else job.exception()
+            if isinstance(error, NeedsDecodingThread) and not done.cancelled():
                 self._is_short = False
                 self._begin_again()
                 try:
-                    long_job = self._admission.submit(lambda: self.decode_here(read), False)
+                    jobs.append(self._admission.submit(lambda: self.decode_here(read), False))
                 except PolicyUnavailable as stopping:
                     error = stopping
                 else:
-                    long_job.add_done_callback(finish)
+                    jobs[-1].add_done_callback(finish)
                     return
+            if job.cancelled():
+                done.cancel()
             if not done.set_running_or_notify_cancel():
                 return
             if error is None:
