@@ -682,3 +682,12 @@ def test_no_client_waits_for_ever_when_the_gateway_restarts_however_often_it_ask
             over.set()
     for one in asking:
         one.result()
+
+
+def test_the_client_of_gr00t_n1_gets_an_error_that_it_can_raise(open_dialect: Any) -> None:
+    client = PolicyClient(open_dialect("gr00t"))
+    # A file of `torch.save`, which is a ZIP archive.
+    client.socket.send(b"PK\x03\x04" + bytes(100))
+    assert client.socket.recv() == b"ERROR"
+    assert client.ping() == {"status": "ok", "message": "Server is running"}
+    client.close()

@@ -8,6 +8,7 @@ import contextlib
 import json
 import threading
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -442,3 +443,57 @@ def test_a_reset_over_http_begins_an_episode_of_the_session_that_it_names() -> N
         assert (answer.status_code, answer.json()) == (200, {})
         assert [count("a"), count("b")] == [1, 2]
         assert client.post("/reset").json()["code"] == "malformed"
+
+
+# The specifications that vla-eval compares with those of its benchmark
+
+POSE = ActionSpec(space="ee_pose", delta=True, rotation="axis_angle")
+SPECS: dict[str, tuple[Contract, dict[str, Any], dict[str, str]]] = {
+    "relative": (Contract(action=POSE), {}, {"position": "delta_xyz", "rotation": "axis_angle"}),
+    "absolute": (
+        Contract(action=replace(POSE, delta=False, rotation="quat_xyzw")),
+        {},
+        {"position": "absolute_xyz", "rotation": "quaternion_xyzw"},
+    ),
+    "not declared": (Contract(action=replace(POSE, delta=None, rotation=None)), {}, {}),
+    "joints": (Contract(action=replace(POSE, space="joint")), {}, {}),
+    "two arms": (Contract(action=replace(POSE, arms=("left", "right"))), {}, {}),
+    "the contract's gripper": (
+        Contract(action=replace(POSE, gripper_open=-1.0, gripper_closed=1.0)),
+        {},
+        {
+            "position": "delta_xyz",
+            "rotation": "axis_angle",
+            "gripper": "binary_close_positive",
+        },
+    ),
+    "the client's gripper": (
+        Contract(action=replace(POSE, gripper_open=-1.0, gripper_closed=1.0)),
+        {"mapping": {"preset": "vla-eval", "action_gripper": {"index": 6, "open": 1, "closed": 0}}},
+        {"position": "delta_xyz", "rotation": "axis_angle", "gripper": "continuous_01"},
+    ),
+    "inputs": (
+        Contract(cameras={"front": CameraSpec()}, instruction=True),
+        {},
+        {"image": "rgb_hwc_uint8", "language": "language"},
+    ),
+}
+
+
+@pytest.mark.parametrize(("contract", "settings", "expected"), SPECS.values(), ids=SPECS)
+def test_vla_eval_is_told_what_the_contract_declares(
+    contract: Contract, settings: dict[str, Any], expected: dict[str, str]
+) -> None:
+    class Declared(Mirror):
+        pass
+
+    Declared.contract = contract
+    with (
+        serving(Declared(), {"vla_eval": settings}) as (client, _),
+        client.websocket_connect("/vla-eval") as socket,
+    ):
+        send(socket, "hello", {"protocol_version": 1}, 0)
+        payload = receive(socket).payload
+    specs = payload.get("action_spec", {}) | payload.get("observation_spec", {})
+    assert {name: spec["format"] for name, spec in specs.items()} == expected
+    assert all(spec["name"] == name for name, spec in specs.items())

@@ -493,3 +493,14 @@ def test_garbage_is_refused(garbage: bytes, place: int) -> None:
         data[:at] + garbage + data[at:],
     ):
         attempt(changed)
+
+
+def test_the_error_for_an_older_lerobot_names_the_oldest_version() -> None:
+    module = "lerobot.scripts.server.helpers"
+    for message, read in (
+        (setup(), lambda data: lerobot.read_instructions(data, MessageLimits())),
+        (robot_saw(0), lambda data: lerobot.read_observation(data, Budget(MessageLimits()))),
+    ):
+        data = pickled(message, protocol=2).replace(HELPERS.encode(), module.encode())
+        with pytest.raises(MalformedMessage, match=r"version 0\.4\.0 or newer"):
+            read(data)

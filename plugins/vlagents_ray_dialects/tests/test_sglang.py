@@ -21,6 +21,7 @@ from starlette.websockets import WebSocketDisconnect
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray_dialects.messages import openpi
+from vlagents_ray_dialects.messages.msgpack import pack
 
 PATH = "/v1/actions/generations"
 STATE = [0.5, 1.5]
@@ -378,3 +379,16 @@ def test_the_metadata_are_those_that_sglangs_clients_read(context: Context) -> N
     assert metadata["output"]["action_dim"] == 7
     assert metadata["capabilities"]["batch_inputs"] is True
     assert client.get("/health").json() == {"status": "ok"}
+
+
+@pytest.mark.parametrize("kind", ["application/json", "application/msgpack"])
+def test_a_camera_as_nested_lists_is_refused_with_the_forms_that_are_read(
+    context: Context, kind: str
+) -> None:
+    client, _ = context
+    payload = asking("task 1", observed() | {"images": {"front": np.zeros((64, 64, 3)).tolist()}})
+    payload["input"]["observation"]["state"] = STATE
+    content = json.dumps(payload).encode() if kind == "application/json" else pack(payload, str)
+    answer = client.post(PATH, content=content, headers={"content-type": kind})
+    assert answer.status_code == 413
+    assert "b64_json" in answer.json()["detail"]

@@ -310,6 +310,13 @@ class GR00TConnection(GatewayClient):
 
     def _answer(self, envelope: Envelope, payload: memoryview) -> bytes:
         """Return the answer to a message, which may be an error."""
+        if payload[: len(gr00t.TORCH_FILE)] == gr00t.TORCH_FILE:
+            self._count_refusal()
+            logger.warning(
+                "gr00t: a client sends files of torch.save, as GR00T N1 does; update it to a "
+                "GR00T N1.5 whose PolicyClient or RobotInferenceClient sends msgpack"
+            )
+            return gr00t.TORCH_ERROR
         try:
             if self._dialect.is_stopping:
                 raise _stopping()

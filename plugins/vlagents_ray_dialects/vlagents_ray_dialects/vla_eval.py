@@ -22,6 +22,7 @@ from starlette.routing import BaseRoute, Route
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.chunking.buffer import ChunkBuffer
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     MalformedMessage,
     MessageTooLarge,
@@ -141,7 +142,26 @@ class VlaEvalDialect(base.RouteDialect):
         }
         if self.config.observation_params:
             payload["observation_params"] = self.config.observation_params
+        # The client compares them with those of its benchmark.
+        contract = self.context.contract
+        if contract is not None:
+            payload |= self._specs(contract)
         return vla_eval.VlaEvalMessage("hello", payload, message.seq)
+
+    def _specs(self, contract: Contract) -> dict[str, Any]:
+        """Return the specifications of actions and observations that the contract declares."""
+        action = contract.action
+        opens_and_closes = None
+        if self.mapping.action_gripper:
+            gripper = self.mapping.action_gripper[0]
+            opens_and_closes = gripper.open, gripper.closed
+        elif action.gripper_open is not None and action.gripper_closed is not None:
+            opens_and_closes = action.gripper_open, action.gripper_closed
+        specs = {
+            "action_spec": vla_eval.action_spec(action, opens_and_closes),
+            "observation_spec": vla_eval.observation_spec(contract),
+        }
+        return {name: spec for name, spec in specs.items() if spec}
 
     async def _act(
         self,

@@ -61,6 +61,11 @@ _TOKEN_BYTES = 4096  # maximum size of an API key, and of the names of the field
 _TOKEN_FIELDS = 16
 
 
+# The beginning of a request of GR00T N1, which is a file of `torch.save`, and the answer that its
+# client raises as an error of the server.
+TORCH_FILE, TORCH_ERROR = b"PK\x03\x04", b"ERROR"
+
+
 def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None:
     """Return the API key in a message, without decoding the other fields.
 

@@ -30,6 +30,8 @@ from vlagents_ray.protocol.values import is_number
 from vlagents_ray_dialects.messages.pickles import NUMPY_CALLS, Name, fields_of, read_pickle
 
 HELPERS = "lerobot.async_inference.helpers"
+# The module of the same classes before LeRobot 0.4.0, which a pickle names at its beginning.
+_OLD_HELPERS, _HEAD_BYTES = b"lerobot.scripts.server.helpers", 128
 SETUP, OBSERVATION = Name(HELPERS, "RemotePolicyConfig"), Name(HELPERS, "TimedObservation")
 # The fields of the data classes that a client pickles.
 _REQUESTS: Mapping[Name, Sequence[str]] = {
@@ -260,6 +262,11 @@ def _global(memo: int, module: str, name: str) -> bytes:
 
 def _pickled_fields(data: Buffer, limits: MessageLimits, class_name: Name) -> dict[str, Any]:
     """Return the fields of the object of a data class in a pickle."""
+    if _OLD_HELPERS in bytes(memoryview(data)[:_HEAD_BYTES]):
+        raise MalformedMessage(
+            "LeRobot: expected a client of version 0.4.0 or newer, got an older one; update it at "
+            "the robot"
+        )
     return fields_of(read_pickle(data, limits, _REQUESTS, NUMPY_CALLS), class_name)
 
 

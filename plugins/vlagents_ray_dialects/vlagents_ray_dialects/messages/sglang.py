@@ -85,10 +85,18 @@ def decode(body: bytes, media_type: str, budget: Budget) -> dict[str, Any]:
         MalformedMessage: The body is not a map in that format.
         MessageTooLarge: The body exceeds a limit.
     """
-    if media_type == MSGPACK:
-        return openpi.decode(body, budget.limits)
-    budget.parse(len(body))
-    payload = json_numpy.loads(body, budget.limits)
+    try:
+        if media_type == MSGPACK:
+            return openpi.decode(body, budget.limits)
+        budget.parse(len(body))
+        payload = json_numpy.loads(body, budget.limits)
+    except MessageTooLarge as error:
+        if len(body) > budget.limits.body_bytes:
+            raise
+        raise MessageTooLarge(
+            f"{error}; an image as nested lists may have at most {budget.limits.items} numbers: "
+            'send it as {"b64_json": …}, a JPEG or PNG file, or as an array in msgpack'
+        ) from error
     if not isinstance(payload, dict):
         raise MalformedMessage(f"body: expected an object, got {type(payload).__name__}")
     return payload

@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.protocol.frame_layout import read_array
@@ -30,6 +31,60 @@ class VlaEvalMessage:
     kind: Kind
     payload: dict[str, Any]
     seq: int = 0
+
+
+# vla-eval's names of rotations and grippers (`vla_eval.specs`). A gripper is named by the values
+# that open and close it.
+_ROTATIONS = {
+    "axis_angle": ("axis_angle", 3),
+    "euler_xyz": ("euler_xyz", 3),
+    "quat_xyzw": ("quaternion_xyzw", 4),
+    "quat_wxyz": ("quaternion_wxyz", 4),
+}
+_GRIPPERS = {
+    (-1.0, 1.0): "binary_close_positive",
+    (1.0, -1.0): "binary_close_negative",
+    (1.0, 0.0): "continuous_01",
+    (0.0, 1.0): "binary_close_01",
+}
+
+
+def action_spec(
+    action: ActionSpec, opens_and_closes: tuple[float, float] | None
+) -> dict[str, dict[str, Any]]:
+    """Return the parts of an action that the contract declares, as vla-eval's `DimSpec.to_dict`
+    does, for a policy that commands the pose of one arm; empty for any other.
+
+    Args:
+        action: The action of the contract.
+        opens_and_closes: The values that open and close the gripper for the client; None if they
+            are not known.
+    """
+    if action.space != "ee_pose" or len(action.arms or ("",)) != 1:
+        return {}
+    spec: dict[str, dict[str, Any]] = {}
+    if action.relative is not None:
+        kind = "delta_xyz" if action.relative else "absolute_xyz"
+        spec["position"] = {"name": "position", "dims": 3, "format": kind}
+    if action.rotation in _ROTATIONS:
+        kind, size = _ROTATIONS[action.rotation]
+        spec["rotation"] = {"name": "rotation", "dims": size, "format": kind}
+    gripper = None if opens_and_closes is None else _GRIPPERS.get(opens_and_closes)
+    if gripper is not None:
+        spec["gripper"] = {"name": "gripper", "dims": 1, "format": gripper}
+    return spec
+
+
+def observation_spec(contract: Contract) -> dict[str, dict[str, Any]]:
+    """Return the parts of an observation that the policy needs, as `action_spec` does. A state is
+    not among them, since a contract does not describe the order of vla-eval's state.
+    """
+    spec: dict[str, dict[str, Any]] = {}
+    if contract.cameras:
+        spec["image"] = {"name": "image", "dims": 0, "format": "rgb_hwc_uint8"}
+    if contract.instruction:
+        spec["language"] = {"name": "language", "dims": 0, "format": "language"}
+    return spec
 
 
 class _File(bytes):
