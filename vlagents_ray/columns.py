@@ -207,21 +207,21 @@ class Columns:
                 row[part] = _write(rotation.kind, _product(*product), numbers)
         return row
 
-    def mean(self, rows: Sequence[np.ndarray], weights: Sequence[float]) -> np.ndarray:
+    def mean(self, rows: Sequence[np.ndarray], weights: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return the weighted mean of rows for the same tick, (D,) float32.
 
         Args:
             rows: The rows, (D,) each; the representation of a rotation is the nearest to the last.
             weights: The weight of each row, at least 0; their sum is above 0.
         """
-        shares = np.asarray(weights) / np.sum(weights)
-        row = np.asarray(shares @ np.stack(rows), np.float32)
+        shares = np.asarray(weights)
+        row = np.asarray((shares / shares.sum()) @ np.array(rows), np.float32)
         for rotation in self.rotations:
             if not rotation.is_linear:
                 part = slice(rotation.start, rotation.stop)
                 numbers = [row_of_tick[part].tolist() for row_of_tick in rows]
                 quaternions = [_read(rotation.kind, of_row) for of_row in numbers]
-                mean = _mean(quaternions, weights)
+                mean = _mean(quaternions, shares)
                 row[part] = _write(rotation.kind, mean, numbers[-1])
         return row
 
@@ -698,12 +698,12 @@ def _fraction(rotation: RotationColumns, numbers: Sequence[float], share: float)
     return _write(rotation.kind, _from_vector([share * number for number in turn]), near)
 
 
-def _mean(rotations: Sequence[_Quaternion], weights: Sequence[float]) -> _Quaternion:
+def _mean(rotations: Sequence[_Quaternion], weights: np.ndarray) -> _Quaternion:
     """Return the mean of rotations with the least weighted sum of squared distances of their
     matrices (Markley et al. 2007, https://doi.org/10.2514/1.28949).
     """
     quaternions = np.array(rotations)
-    _, vectors = np.linalg.eigh((quaternions.T * np.asarray(weights)) @ quaternions)
+    _, vectors = np.linalg.eigh((quaternions.T * weights) @ quaternions)
     w, x, y, z = vectors[:, -1].tolist()
     return w, x, y, z
 

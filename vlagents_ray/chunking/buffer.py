@@ -272,7 +272,8 @@ class ChunkBuffer:
         """
         columns = Columns.from_spec(self.action, len(rows[0]))
         if newer is None:
-            return columns.mean(rows, [math.exp(-self._m * i) for i in range(len(rows))])
+            weights = np.exp(-self._m * np.arange(len(rows)))
+            return columns.mean(rows, weights)
         mean = rows[0]
         for row in rows[1:]:
             mean = columns.mean([mean, row], [1.0 - newer, newer])

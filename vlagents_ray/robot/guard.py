@@ -575,14 +575,27 @@ class Guard:
         if self._max_step is None:
             return
         steps = self._limits[2]
-        for i, size in self._sizes(columns.step(numbers, last_numbers)):
-            rounding = 2 * _ROUNDING * max(abs(numbers[i]), abs(last_numbers[i]))
-            if size > steps[i] + rounding:
-                raise InvalidAction(
-                    f"action[{i}]: expected a step of at most max_step, {steps[i]:.3g}, got "
-                    f"{numbers[i]:g} after {last_numbers[i]:g}, {size:.3g} away",
-                    cause="max_step",
-                )
+        differences = columns.step(numbers, last_numbers)
+        for i in self._numbers:
+            if abs(differences[i]) > steps[i]:
+                self._check_step(i, abs(differences[i]), numbers, last_numbers)
+        for turn in self._turns:
+            size = math.hypot(*(differences[i] for i in turn))
+            self._check_step(turn[0], size, numbers, last_numbers)
+
+    def _check_step(
+        self, i: int, size: float, numbers: list[float], last_numbers: list[float]
+    ) -> None:
+        """Raise `InvalidAction` if the difference of a number or a rotation exceeds `max_step` by
+        more than its rounding.
+        """
+        limit = self._limits[2][i]
+        if size > limit + 2 * _ROUNDING * max(abs(numbers[i]), abs(last_numbers[i])):
+            raise InvalidAction(
+                f"action[{i}]: expected a step of at most max_step, {limit:.3g}, got "
+                f"{numbers[i]:g} after {last_numbers[i]:g}, {size:.3g} away",
+                cause="max_step",
+            )
 
     def _check_dynamics(
         self, columns: Columns, numbers: list[float], last_numbers: list[float]
