@@ -813,7 +813,7 @@ ARM = ["--robot", SIMULATED]
         (["--measure", "elbow", *ARM, "--max-step", "1"], "elbow"),
         (
             ["--measure", "jonts", *ARM],
-            "--measure: expected a part of the robot's state, one of .*'joints'.*, got 'jonts'",
+            "--measure: expected parts of the robot's state, of .*'joints'.*, got 'jonts'",
         ),
     ],
 )

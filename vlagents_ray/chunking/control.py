@@ -31,6 +31,12 @@ class Leader(Protocol):
     called when the device's action was not executed. The next target then begins at `last`, the
     executed command, (D,) float32, or at the robot's measured pose if `last` is None. Otherwise,
     the targets would move on while the guard rejects them.
+
+    A device that commands grippers also has a method `begin(last)`, which is called before the
+    first `action` of a takeover, with the last command, (D,) float32, or None if there is none. A
+    gripper keeps this command until the operator changes it. With a method `join(arm)`, it gets the
+    actions of the robot's contract (`ActionSpec`) before that: the arm may know grippers that the
+    policy's contract does not declare.
     """
 
     def engaged(self) -> bool:

@@ -226,6 +226,11 @@ class Motion:
         """Whether an action was commanded in this episode."""
         return self._last is not None
 
+    @property
+    def last(self) -> np.ndarray | None:
+        """The last command of this episode, (D,) float32; None before the first one."""
+        return None if self._last is None else self._last.copy()
+
     def keeps(self, plan: ChunkBuffer) -> bool:
         """Return whether the plan must not be replaced, since a robot that began at rest is
         approaching the next row.
@@ -258,7 +263,7 @@ class Motion:
                 self._last, self._state = self._checked(action, self._last), "moving"
                 return self._last
 
-        last = self._last if self._state == "moving" else self._begins_at(action, obs)
+        last = self._last if self._state == "moving" else self._standing(obs, action)
         self._last, self._state = self._checked(action, last), "moving"
         return self._last
 
@@ -283,7 +288,7 @@ class Motion:
 
         ease_in = getattr(self._check, "ease_in", None)
         if self._state != "moving" and ease_in is not None:
-            start = self._last if self._state == "held" else self._begins_at(action, obs)
+            start = self._last if self._state == "held" else self._standing(obs, action)
             ease = ease_in(start, action, plan=plan.leftover())
             if ease is not None:
                 self._ease, self._last, self._state = ease, start, "moving"
@@ -326,23 +331,12 @@ class Motion:
         self._last = action
         return action.copy(), why
 
-    def _begins_at(self, action: np.ndarray, obs: Obs) -> np.ndarray | None:
-        """Return the position at which the motion to an action begins, (D,); None if it is unknown.
-
-        Before the first command, the goals of the grippers are unknown. Their measured openings are
-        not their goals: a gripper that holds an object would open if it were commanded to stay as
-        it is measured. Its first command is therefore the value of the action.
+    def _standing(self, obs: Obs, action: np.ndarray | None = None) -> np.ndarray | None:
+        """Return the position of a robot at rest, (D,), before a motion to `action`; None if the
+        position is unknown.
         """
-        start = self._standing(obs)
-        if self._last is None and start is not None and start.shape == np.shape(action):
-            grippers = list(Columns.from_spec(self._spec, len(start), self._arm).grippers)
-            start[grippers] = np.asarray(action, np.float32)[grippers]
-        return start
-
-    def _standing(self, obs: Obs) -> np.ndarray | None:
-        """Return the robot's position, (D,); None if it is unknown."""
         reference = getattr(self._check, "reference", None)
-        return self._last if reference is None else reference(obs, self._last)
+        return self._last if reference is None else reference(obs, self._last, action)
 
     def _checked(self, action: np.ndarray, last: np.ndarray | None) -> np.ndarray:
         """Return an action, (D,) float32, that may be sent to the robot; raises `InvalidAction`

@@ -289,6 +289,7 @@ class ChunkPlayer(Agent):
         # The actions, (D,), that replaced the policy's actions since the last request.
         self._replacements = deque[np.ndarray](maxlen=_MAX_REPLACEMENTS)
         self._is_replaced = False  # whether the policy's action of this tick was replaced
+        self._was_operated = False  # whether an operator moved the robot at the last tick
         self._chunks = 0  # the number of answers
         self.rows = 0
         self._ticks_of_rows = 0  # the number of ticks at which a row, or a part of it, was executed
@@ -335,7 +336,7 @@ class ChunkPlayer(Agent):
         """Join the arm's description of its columns to the policy's, before a `reset`.
 
         The arm may know grippers that the policy's contract does not declare. The check, such as a
-        `vlagents_ray.robot.Guard`, gets the same description.
+        `vlagents_ray.robot.Guard`, and the operator's device get the same description.
 
         Args:
             arm: The actions of the robot's contract.
@@ -344,9 +345,10 @@ class ChunkPlayer(Agent):
             ConfigError: The descriptions contradict each other.
         """
         self._arm = arm
-        join = getattr(self.check, "join", None)
-        if join is not None:
-            join(arm)
+        for part in (self.check, self.control.leader):
+            join = getattr(part, "join", None)
+            if join is not None:
+                join(arm)
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode, without a time limit. The plan and pending requests are dropped."""
@@ -435,10 +437,14 @@ class ChunkPlayer(Agent):
         self._tick = tick + 1
 
         if not is_operated:
+            self._was_operated = False
             act = self._policy_act(obs, tick)
             self.timeliness.count(act.info)
             self._executed_age_ms = act.info.get(AGE_MS, self._executed_age_ms)
             return act
+        if not self._was_operated:
+            self._begin_takeover()
+        self._was_operated = True
         act = self._operator_act(obs)
         if SAFE not in act.info:  # The operator's action replaces a row.
             self._record_replacement(act.action)
@@ -641,6 +647,12 @@ class ChunkPlayer(Agent):
             info |= {SAFE: why.reason, CAUSE: why.cause}
             self._rebase_leader(action)
         return Act(action.copy(), info=info)
+
+    def _begin_takeover(self) -> None:
+        """Report the last command to the operator's device (see `Leader`)."""
+        begin = getattr(self.control.leader, "begin", None)
+        if begin is not None:
+            begin(self._motion.last)
 
     def _rebase_leader(self, last: np.ndarray | None) -> None:
         """Report to the operator's device that the device's action was not executed (see

@@ -18,7 +18,7 @@ import logging
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
@@ -32,7 +32,8 @@ from vlagents_ray.cli.examples import EXAMPLES
 from vlagents_ray.cli.help_page import HelpPage, HelpPanel, HelpRow, error_line
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
-from vlagents_ray.contract import Contract
+from vlagents_ray.columns import Columns
+from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, VLAgentsError, printable
 from vlagents_ray.interface import Agent
 from vlagents_ray.naming import did_you_mean
@@ -46,6 +47,7 @@ from vlagents_ray.robot.loop import (
     LoopReport,
     Restart,
     Robot,
+    contract_of,
     fit_of,
     opened,
     robot_factory,
@@ -194,7 +196,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
 
         make_robot = make_robot or partial(SimulatedRobot, contract)
         robot = stack.enter_context(opened(make_robot))
-        _require_part(options.measure, robot)
+        _require_measure(options.measure, contract, robot, say)
         fit = _require_fit(options, agent, robot, guard.limits, say)
 
         recorder = None
@@ -289,7 +291,7 @@ def _opened_leader(
     say: Callable[[str], None],
 ) -> Iterator[Leader]:
     """Open the operator's device within the context, and print how to use it."""
-    measure = measured_state(options.measure)
+    measure = measured_state(*options.measure)
     with open_leader(contract, step=options.step, measure=measure) as leader:
         help_text = getattr(leader, "help", "")
         if help_text:
@@ -302,7 +304,7 @@ def _guard(options: argparse.Namespace, contract: Contract | None, hz: float) ->
     return Guard(
         contract,
         max_step=options.max_step,
-        measure=measured_state(options.measure),
+        measure=measured_state(*options.measure),
         limits=options.limits,
         hz=hz,
         soft_start_s=options.soft_start_s,
@@ -338,18 +340,78 @@ def _player_settings(
     )
 
 
-def _require_part(name: str | None, robot: Robot) -> None:
-    """Raise `ConfigError`, before the robot moves, if the robot's state lacks the part that
-    --measure names.
+def _require_measure(
+    names: Sequence[str], contract: Contract | None, robot: Robot, say: Callable[[str], None]
+) -> None:
+    """Check the parts of the state with the measured pose, before the robot moves. If there are
+    none, say so, as the first action may then be anywhere.
+
+    Args:
+        names: The parts that --measure names, in the order of an action.
+        contract: The policy's contract.
+        robot: The robot.
+        say: Prints a line.
+
+    Raises:
+        ConfigError: The robot's state lacks a part, or the parts have another number of values than
+            an action.
     """
-    if name is None:
-        return
     state = robot.observe().state
-    if name not in state:
+    for name in names:
+        if name not in state:
+            raise ConfigError(
+                f"--measure: expected parts of the robot's state, of {sorted(state)}, got "
+                f"{name!r}{did_you_mean(name, state)}"
+            )
+
+    spec = contract.action if contract is not None else ActionSpec()
+    if spec.dim is None:
+        return
+    columns = Columns.from_spec(spec, spec.dim, contract_of(robot).action)
+    joint_count = spec.dim - len(columns.grippers)
+    sizes = {name: len(values) for name, values in state.items()}
+    measured = sum(sizes[name] for name in names)
+    if names and measured not in (spec.dim, joint_count):
+        without = f", or {joint_count} without grippers" if columns.grippers else ""
         raise ConfigError(
-            f"--measure: expected a part of the robot's state, one of {sorted(state)}, got "
-            f"{name!r}{did_you_mean(name, state)}"
+            f"--measure: expected parts with {spec.dim} numbers, as an action has{without}, got "
+            f"{measured} in {', '.join(f'{name} ({sizes[name]})' for name in names)}; the robot's "
+            f"state has {', '.join(f'{name} ({size})' for name, size in sizes.items())}"
         )
+
+    has_targets = len(columns.absolute) > len(columns.grippers)
+    if not names and has_targets and not getattr(robot, "simulated", False):
+        found = _measurable_parts(sizes, spec.arms or (), (spec.dim, joint_count))
+        cure = (
+            f"give --measure {','.join(found)}"
+            if found
+            else (
+                "add the pose to the robot's state, in the order of an action, and name it with "
+                "--measure"
+            )
+        )
+        say(
+            "no measured pose: the first action is not compared with the pose of the robot, and "
+            f"may be anywhere within the limits; {cure}"
+        )
+
+
+def _measurable_parts(
+    sizes: Mapping[str, int], arms: Sequence[str], numbers: Collection[int]
+) -> list[str]:
+    """Return the parts of a state that contain the pose of an action: the joints of each arm, with
+    or without its gripper; [] if there are no such parts.
+
+    Args:
+        sizes: The number of values of each part.
+        arms: The names of several arms, in the order of an action; empty for one arm.
+        numbers: The numbers of values that the parts may have together.
+    """
+    for of_arm in (("joints", "gripper"), ("joints",)):
+        parts = [f"{arm}/{name}" for arm in arms for name in of_arm] if arms else [*of_arm]
+        if all(part in sizes for part in parts) and sum(sizes[part] for part in parts) in numbers:
+            return parts
+    return []
 
 
 def _require_fit(
@@ -820,8 +882,11 @@ def _add_safety_options(options: _Options) -> None:
     )
     options.robot(
         "--measure",
-        metavar="PART",
-        help="Part of the state with the measured pose, such as joints. The first action is "
+        type=_parts,
+        default=(),
+        metavar="PARTS",
+        help="Parts of the state with the measured pose, in the order of an action, with or "
+        "without grippers, such as joints, or left/joints,right/joints. The first action is "
         "compared with this pose.",
     )
     options.robot(
@@ -849,6 +914,11 @@ def _add_safety_options(options: _Options) -> None:
         help="How the robot restarts after a stop: with Enter, C or SIGUSR1 (manual), or when the "
         "server answers again (auto); default: manual, for a simulated robot auto.",
     )
+
+
+def _parts(text: str) -> tuple[str, ...]:
+    """Return the names of parts of the state that commas separate."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def _add_server_options(options: _Options) -> None:

@@ -87,6 +87,7 @@ class Guard:
         self.hz = hz
         self._spec = spec
         self._dim = spec.dim
+        self._joint_unit = _joint_unit(contract)
 
         bounds = limits or MotionLimits()
         self._low = _strictest("low", np.maximum, spec, spec.low, low, bounds.low)
@@ -142,45 +143,59 @@ class Guard:
         if dim is not None:
             self._limits_of(dim)
 
-    def reference(self, obs: Obs, last: np.ndarray | None) -> np.ndarray | None:
+    def reference(
+        self, obs: Obs, last: np.ndarray | None, action: np.ndarray | None = None
+    ) -> np.ndarray | None:
         """Return the pose with which the first action, or the first action after a stop, is
         compared.
+
+        The measured opening of a gripper is not its goal: a gripper that holds an object would let
+        go if it were commanded to stay as it is measured. Its goal is the last command; before the
+        first command, the goal is unknown, and the pose has the value of the action.
 
         Args:
             obs: The current observation.
             last: The last commanded action, (D,); None before the first action.
+            action: The action at which the motion ends, (D,), if it is known.
 
         Returns:
-            The measured pose, (D,) float32; `last` if the guard has no `measure`.
+            The measured pose, (D,) float32; `last` if the guard has no `measure`. None if no
+            gripper was measured, and no goal of a gripper is known.
 
         Raises:
             ConfigError: `measure` returns another number of values than an action has.
             InvalidAction: `measure` returns NaN or infinity, so that no action can be checked.
         """
         self._accepted = None
-        columns = None if last is None else self._columns_of(len(last))
         if self._measure is None:
-            return last if columns is None or last is None else columns.still(last)
+            return None if last is None else self._columns_of(len(last)).still(last)
 
-        pose = np.array(self._measure(obs), np.float32)
-        dim = self._dim if last is None else len(last)
-        if pose.ndim != 1 or dim not in (None, len(pose)):
+        goal = action if last is None else last
+        measured = np.array(self._measure(obs), np.float32)
+        dim = self._dim if goal is None else len(goal)
+        columns = self._columns_of(measured.size if dim is None else dim)
+        grippers = list(columns.grippers)
+        if measured.ndim != 1 or len(measured) not in (columns.dim, columns.dim - len(grippers)):
+            others = f", or {columns.dim - len(grippers)} without grippers" if grippers else ""
             raise ConfigError(
-                f"measure: expected the shape of an action, ({dim or 'D'},), got {pose.shape}; "
-                "return one number for each number of an action"
+                f"measure: expected the shape of an action, ({dim or 'D'},), got {measured.shape}; "
+                f"return one number for each number of an action{others}"
             )
-        if not np.isfinite(pose).all():
+        if not np.isfinite(measured).all():
             raise InvalidAction(
-                f"measure: expected finite numbers, got {pose.tolist()}; the robot's sensors are "
-                "broken"
+                f"measure: expected finite numbers, got {measured.tolist()}; the robot's sensors "
+                "are broken"
             )
 
-        if columns is not None and last is not None:
-            # Grippers keep their last command, since commanding the measured opening would loosen
-            # the grasp.
-            grippers = list(columns.grippers)
-            pose[grippers] = last[grippers]
-        return self._columns_of(len(pose)).still(pose)
+        pose = measured
+        if len(measured) < columns.dim:
+            if goal is None:
+                return None
+            pose = np.array(goal, np.float32)
+            pose[[i for i in range(columns.dim) if i not in grippers]] = measured
+        if goal is not None:
+            pose[grippers] = goal[grippers]
+        return columns.still(pose)
 
     def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
         """Return an action if the robot may execute it.
@@ -710,11 +725,19 @@ class Guard:
         per_s = (self.hz or 1.0) ** order
         is_soft = self._ticks_with_motion < self._soft_ticks
         soft = ", lowered by the soft start" if is_soft else ""
+        power = "/s" if order == 1 else f"/s^{order}"
         return InvalidAction(
             f"action[{i}]: expected {quantity} of at most {limit * per_s:.3g} "
-            f"(units/s^{order}{soft}), got {value * per_s:.4g}",
+            f"{self._unit_of(i)}{power}{soft}, got {value * per_s:.4g}",
             cause="max_step" if order == 1 else "dynamics",
         )
+
+    def _unit_of(self, i: int) -> str:
+        """Return the unit of a number of an action; "units" if the contract does not declare it."""
+        columns = self._columns
+        if columns is None or i in columns.grippers:
+            return "units"
+        return columns.units[i] or self._joint_unit or "units"
 
     def _check_workspace(self, limits: MotionLimits, tip: tuple[float, float, float]) -> None:
         """Raise `InvalidAction` if the tip, m, would leave the workspace."""
@@ -731,26 +754,41 @@ class Guard:
                     )
 
 
-def measured_state(name: str | None) -> Callable[[Obs], np.ndarray] | None:
-    """Return a `measure` of a `Guard` that reads a part of the state.
+def measured_state(*names: str) -> Callable[[Obs], np.ndarray] | None:
+    """Return a `measure` of a `Guard` that reads parts of the state.
 
     Args:
-        name: The name of the part, such as "joints"; None measures nothing.
+        names: The names of the parts in the order of an action, such as "joints", or "left/joints"
+            and "right/joints"; without names, nothing is measured.
 
     Returns:
-        The function, which raises `MissingState` if an observation lacks the part; None without a
-        name.
+        The function, which raises `MissingState` if an observation lacks a part; None without
+        names.
     """
-    if name is None:
+    if not names:
         return None
 
     def measure(obs: Obs) -> np.ndarray:
-        """Return that part of the state, (D,)."""
-        if name not in obs.state:
-            raise MissingState(name, obs.state)
-        return obs.state[name]
+        """Return these parts of the state, (D,)."""
+        missing = [name for name in names if name not in obs.state]
+        if missing:
+            raise MissingState(missing[0], obs.state)
+        return np.concatenate([obs.state[name] for name in names])
 
     return measure
+
+
+def _joint_unit(contract: Contract | None) -> str | None:
+    """Return the unit of commanded joints, which is the unit of the measured joints; None if the
+    contract does not declare it.
+    """
+    if contract is None or contract.action.space != "joint":
+        return None
+    units = set()
+    for name, part in (contract.state or {}).items():
+        if name.rpartition("/")[2] == "joints":  # the name of the part without the arm's name
+            units.add(part.unit)
+    return units.pop() if len(units) == 1 else None
 
 
 def _not_measurable() -> ConfigError:

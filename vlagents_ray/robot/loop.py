@@ -30,6 +30,7 @@ from vlagents_ray.abilities import (
 )
 from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.fallback import Cause, Held
+from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.chunking.timeliness import Timeliness
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
@@ -554,6 +555,11 @@ def run_loop(
     agent.initialize()
     guard = _guard_of(agent, options.guard, hz)
     fit = options.fit or fit_of(agent, robot, guard.limits)
+    # The arm may know grippers that the policy's contract does not declare.
+    arm = contract_of(robot).action
+    guard.join(arm)
+    if isinstance(agent, ChunkPlayer):
+        agent.join(arm)
     has_control = ability(agent, HasControl)
     has_check = ability(agent, HasCheck)
     run = _Run(
@@ -860,7 +866,9 @@ class _Run:
             self.fit = None
 
         if not self.agent_has_guard:
-            last = self.guard.reference(obs, self.last) if self.standing else self.last
+            last = self.last
+            if self.standing:
+                last = self.guard.reference(obs, self.last, action)
             action = self.guard(action, last)
 
         hold = self._command(action)

@@ -186,6 +186,12 @@ class LeRobotRobot:
         return unit
 
     @property
+    def _grippers(self) -> tuple[int, ...]:
+        """The indices of the grippers in an action, by the names of the motors."""
+        names = enumerate(self.joint_names)
+        return tuple(index for index, name in names if "gripper" in name.lower())
+
+    @property
     def joint_names(self) -> list[str]:
         """The names of the motors, in the order of an action."""
         return [key.removesuffix(".pos") for key in self._keys]
@@ -231,7 +237,12 @@ class LeRobotRobot:
             cameras=cameras,
             state={"joints": StateSpec(len(self._keys), self._unit)},
             gripper=False,
-            action=ActionSpec(dim=len(self._keys), space="joint", delta=False),
+            action=ActionSpec(
+                dim=len(self._keys),
+                space="joint",
+                delta=False,
+                grippers=self._grippers,
+            ),
         )
 
     def observe(self) -> Obs:
@@ -258,8 +269,8 @@ class LeRobotRobot:
         """Make the measured positions the goal; torque stays on, so that the arm does not fall.
 
         No camera is read. If there is no bus, or the bus cannot be read, the goal is the pose of
-        the last observation. The grippers keep their goal. Every arm is stopped, even if stopping
-        another arm fails.
+        the last observation. The grippers keep their goal, also that of an earlier program. Every
+        arm is stopped, even if stopping another arm fails.
 
         Raises:
             Exception: The motors of an arm cannot be reached, or the robot was commanded and no
@@ -288,11 +299,14 @@ class LeRobotRobot:
             )
             return
 
-        if self._goal is not None:
-            grippers = ["gripper" in name for name in arm.motors]
-            positions[grippers] = self._goal[arm.indices][grippers]
-
         goals = dict(zip(arm.motors, map(float, positions), strict=True))
+        for name, index in zip(arm.motors, arm.indices, strict=True):
+            if index not in self._grippers:
+                continue
+            if self._goal is None:
+                del goals[name]  # the goal of an earlier program is not known, and stays as it is
+            else:
+                goals[name] = float(self._goal[index])
         try:
             arm.robot.send_action({f"{name}.pos": goal for name, goal in goals.items()})
         except Exception:

@@ -232,12 +232,13 @@ class MujocoArm:
         self._queue.append((self._now() + self._latency_s, action))
 
     def stop(self) -> None:
-        """Make the measured positions the targets; the gripper keeps its grasp."""
+        """Make the measured positions the targets; the gripper keeps its last command."""
         self._advance()
+        last = self._queue[-1][1] if self._queue else self._goal
         self._queue.clear()
         targets = []
         for i, drive in enumerate(self._flat):
-            targets.append(self._goal[i] if drive.gripper else self._measured(drive))
+            targets.append(last[i] if drive.gripper else self._measured(drive))
         self._goal = np.array(targets)
         self._target = self._goal
 

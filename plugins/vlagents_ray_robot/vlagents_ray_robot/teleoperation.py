@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.chunking.control import Leader
-from vlagents_ray.contract import Contract
+from vlagents_ray.columns import Columns
+from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, MissingState
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
@@ -85,9 +86,10 @@ class AxesLeader:
     """A leader that turns the axes of a device into actions.
 
     Axis i moves number i of the action: for relative actions of an end effector these are x, y, z
-    and, if the action has them, rotations; otherwise the first six joints. The gripper is the
-    number of `ActionSpec.gripper_columns`. At a takeover the gripper stays open if it is fully
-    open; otherwise it is closed, as it may hold something.
+    and, if the action has them, rotations; otherwise the first six joints. A button opens and
+    closes the gripper, see `Columns`; a gripper whose open and closed values are not declared is a
+    number like the others. At a takeover, a gripper keeps its last command. Without a command, it
+    stays open if it is measured as fully open; otherwise it is closed, as it may hold something.
 
     Args:
         contract: The policy's contract, which declares `action.dim` and whether actions are
@@ -96,8 +98,8 @@ class AxesLeader:
         step: The change of a number per tick at the full deflection of an axis, in the action's
             units; default: half of the action's bound, if actions are relative and bounded.
         measure: Returns the robot's pose in an observation, (D,) in the action's order and units,
-            at which absolute targets begin; default: the state's part `joints`, with the gripper's
-            command after it.
+            with or without the gripper, at which absolute targets begin; default: the state's part
+            `joints`.
 
     Raises:
         ConfigError: The contract is incomplete, or has several grippers, which a single button
@@ -131,26 +133,12 @@ class AxesLeader:
         self._spec = spec
         self._device = device
         self._step = step
-        self._dim = spec.dim
-
-        self._grippers = spec.gripper_columns(spec.dim)
-        if len(self._grippers) > 1:
-            raise ConfigError(
-                f"teleoperation: expected at most one gripper, got the columns {self._grippers} of "
-                f"the arms {spec.arms}; the device has one button, and would move a gripper that "
-                "the operator does not see to; write a leader for both arms"
-            )
-        if self._grippers and (spec.gripper_open is None or spec.gripper_closed is None):
-            raise ConfigError(
-                "teleoperation: expected both `gripper_open` and `gripper_closed` in the "
-                f"contract's action, got {spec.gripper_open} and {spec.gripper_closed}; declare "
-                f"both "
-                "in the policy's contract"
-            )
-
+        self._columns = Columns.from_spec(spec, spec.dim)
+        self._button = _button_column(self._columns)  # the gripper that the button operates
         self._measure = measure
         self._engaged = False
-        self._closed: bool | None = None  # None before the gripper is read at a takeover
+        # The last command of the robot, (D,), whose grippers are kept; None if it is unknown.
+        self._last: np.ndarray | None = None
         self._target: np.ndarray | None = None  # the last target, (D,), if actions are absolute
 
     @property
@@ -165,10 +153,30 @@ class AxesLeader:
         """Read the device, and return whether the operator moves the robot."""
         engaged = self._device.engaged()
         if engaged and not self._engaged:  # the beginning of a takeover
-            self._closed = None
-            self._target = None
+            self.begin(None)
         self._engaged = engaged
         return engaged
+
+    def join(self, arm: ActionSpec) -> None:
+        """Join the arm's description of its grippers to the policy's.
+
+        Args:
+            arm: The actions of the robot's contract.
+
+        Raises:
+            ConfigError: The robot has several grippers, which a single button cannot operate.
+        """
+        self._columns = Columns.from_spec(self._spec, self._columns.dim, arm)
+        self._button = _button_column(self._columns)
+
+    def begin(self, last: np.ndarray | None) -> None:
+        """Begin a takeover.
+
+        Args:
+            last: The last command, (D,), whose grippers are kept; None if there is none.
+        """
+        self._last = None if last is None else np.array(last, np.float32)
+        self._target = None
 
     def rebase(self, last: np.ndarray | None) -> None:
         """Begin the next absolute target at another pose.
@@ -177,6 +185,11 @@ class AxesLeader:
             last: The last command, (D,); None for the measured pose.
         """
         self._target = None if last is None else np.array(last, np.float32)
+        if self._target is not None and self._last is not None:
+            pressed = self._last[self._button] if self._button is not None else None
+            self._last = self._target.copy()
+            if pressed is not None:
+                self._last[self._button] = pressed  # the operator's press still applies
 
     def action(self, obs: Obs) -> np.ndarray:
         """Return the action of the axes at the last reading, (D,) float32.
@@ -184,44 +197,97 @@ class AxesLeader:
         Raises:
             MissingState: The observation has no pose at which an absolute target begins.
         """
-        spec = self._spec
-        axes = self._device.axes()
-        action = np.zeros(self._dim, np.float32)
-        n = min(self._dim - len(self._grippers), len(axes))
-        action[:n] = self._step * axes[:n]
+        spec, dim = self._spec, self._columns.dim
+        moved = [column for column in range(dim) if column != self._button]
+        axes = self._device.axes()[: len(moved)]
+        motion = np.zeros(dim, np.float32)
+        motion[moved[: len(axes)]] = self._step * axes
 
-        gripper_command = self._gripper_command(obs) if self._grippers else None
-        if not spec.relative:
-            if self._target is None:
-                self._target = self._start(obs, gripper_command)
-            action = self._target + action
-            if spec.low is not None or spec.high is not None:
-                action = np.clip(action, spec.low, spec.high)
-            self._target = action
+        if self._target is None:
+            self._target = self._start(obs)
+        action = self._columns.moved(self._target, motion.tolist())
+        if not spec.relative and (spec.low is not None or spec.high is not None):
+            action = np.clip(action, spec.low, spec.high)
+        if self._button is not None:
+            action[self._button] = self._gripper_command(obs)
 
-        if gripper_command is not None:
-            action[self._grippers] = gripper_command
-        return action.astype(np.float32)
+        self._target = self._last = action
+        return action.copy()
 
     def _gripper_command(self, obs: Obs) -> float:
-        """Return the command of the gripper, which its button opens and closes."""
-        if self._closed is None:
-            self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
-        if self._device.gripper_presses() % 2:
-            self._closed = not self._closed
-        command = self._spec.gripper_closed if self._closed else self._spec.gripper_open
-        return float(command or 0.0)
+        """Return the command of the gripper that the button opens and closes."""
+        opened = float(self._columns.gripper_open or 0.0)
+        closed = float(self._columns.gripper_closed or 0.0)
+        if self._last is not None and self._button is not None:
+            command = float(self._last[self._button])
+        else:
+            is_open = obs.gripper is not None and obs.gripper >= _FULLY_OPEN
+            command = opened if is_open else closed
 
-    def _start(self, obs: Obs, gripper_command: float | None) -> np.ndarray:
-        """Return the pose at which absolute targets begin, (D,) float32."""
+        if self._device.gripper_presses() % 2:
+            is_open = abs(command - opened) < abs(command - closed)
+            command = closed if is_open else opened
+        return command
+
+    def _start(self, obs: Obs) -> np.ndarray:
+        """Return the pose at which absolute targets begin, (D,) float32. Its grippers have their
+        last commands, if these are known.
+        """
+        dim, grippers = self._columns.dim, list(self._columns.grippers)
+        pose = np.zeros(dim, np.float32) if self._last is None else self._last.copy()
+        others = [column for column in range(dim) if column not in grippers]
+        is_needed = any(column in others for column in self._columns.absolute)
+        if self._last is None and grippers and self._button is None:
+            is_needed = True
+        if not is_needed:
+            return pose
+
+        measured = self._measured(obs)
+        has_goals = self._last is not None or self._button is not None
+        if measured.shape == (dim,):
+            pose[others] = measured[others]
+            if self._last is None:
+                pose[grippers] = measured[grippers]
+        elif measured.shape == (len(others),) and has_goals:
+            pose[others] = measured
+        else:
+            raise ConfigError(
+                f"measure: expected the pose of an action, ({dim},), at which its targets begin, "
+                f"got {measured.shape}; give a function that returns it (--measure)"
+            )
+        return pose
+
+    def _measured(self, obs: Obs) -> np.ndarray:
+        """Return the measured pose, with or without the grippers."""
         if self._measure is not None:
             return np.array(self._measure(obs), np.float32)
         if "joints" not in obs.state:
             raise MissingState("joints", obs.state)
-        pose = [*obs.state["joints"]]
-        if gripper_command is not None:
-            pose.append(gripper_command)
-        return np.array(pose, np.float32)
+        return np.array(obs.state["joints"], np.float32)
+
+
+def _button_column(columns: Columns) -> int | None:
+    """Return the column of the gripper that a button opens and closes; None if there is no gripper,
+    or if its open and closed values are not declared.
+
+    Raises:
+        ConfigError: There are several grippers, or only one of the values is declared.
+    """
+    ends = (columns.gripper_open, columns.gripper_closed)
+    if ends == (None, None) or not columns.grippers:
+        return None
+    if len(columns.grippers) > 1:
+        raise ConfigError(
+            f"teleoperation: expected at most one gripper, got the columns "
+            f"{list(columns.grippers)}; the device has one button, and would move a gripper that "
+            "the operator does not see to; write a leader for both arms"
+        )
+    if None in ends:
+        raise ConfigError(
+            "teleoperation: expected both `gripper_open` and `gripper_closed` in the contract's "
+            f"action, got {ends[0]} and {ends[1]}; declare both in the policy's contract"
+        )
+    return columns.grippers[0]
 
 
 # A keyboard as a device with axes. It is read from the terminal, so that it also works over SSH.

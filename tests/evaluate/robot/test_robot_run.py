@@ -295,7 +295,7 @@ def test_a_policy_that_fails_has_failed_without_a_verdict(tmp_path: Path) -> Non
 
 
 def test_a_mistake_in_the_settings_shows_before_the_first_trial(tmp_path: Path) -> None:
-    config = plan(tmp_path / "out", robot={"measure": "elbow", "max_step": 0.1})
+    config = plan(tmp_path / "out", robot={"measure": ["elbow"], "max_step": 0.1})
     person = ScriptedPerson(judged("s"))
     with pytest.raises(MissingState, match=r"policy 'policy-walrus'.*elbow"):
         evaluate_on_robot(config, person, agent_factory=Policies())

@@ -432,9 +432,10 @@ class RobotConfig(_PlanModel):
         default=None,
         description="Largest change of an action value from one tick to the next.",
     )
-    measure: str | None = Field(
-        default=None,
-        description="Part of the state with the measured pose, such as `joints`.",
+    measure: list[str] = Field(
+        default=[],
+        description="Parts of the state with the measured pose, in the order of an action, such as "
+        "`[joints]`.",
     )
     limits: str | None = Field(
         default=None,

@@ -389,7 +389,7 @@ def _player(
         guard = Guard(
             agent.contract,
             max_step=settings.max_step,
-            measure=measured_state(settings.measure),
+            measure=measured_state(*settings.measure),
             limits=settings.limits,
             hz=settings.hz,
             soft_start_s=0.0,  # all trials of all policies then have the same limits

@@ -632,7 +632,9 @@ class RosRobot:
     def stop(self) -> None:
         """Publish the stop of each topic: zeros, or the measured pose if that is recent.
 
-        Grippers keep their last command, as the measured opening would loosen their grasp.
+        Grippers keep their last command, as the measured opening would loosen their grasp. For the
+        same reason, nothing is published on a topic of targets with a gripper before the first
+        command.
         """
         self._stop_unsent = not self._link.up  # An unsent stop is sent when the link is up again.
         for index, command in enumerate(self.settings.actions):
@@ -640,7 +642,10 @@ class RosRobot:
                 continue
 
             grippers = self.settings.grippers_of(command)
-            if command.stop in ("", ZEROS):
+            is_target = command.stop not in ("", ZEROS)
+            if is_target and grippers and index not in self._commanded:
+                continue  # the goals of its grippers are not known, and it was not moved
+            if not is_target:
                 row = np.zeros(command.dim, np.float32)
                 row[grippers] = self._measured_opening()
             else:
