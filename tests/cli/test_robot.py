@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import itertools
+import json
 import os
 import pty
 import re
@@ -29,7 +30,9 @@ from typer.testing import CliRunner
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
 from vlagents_ray.cli.main import app
 from vlagents_ray.cli.robot import _restarting as restarting
+from vlagents_ray.cli.robot import command_parser
 from vlagents_ray.cli.robot import main as drive
+from vlagents_ray.contract import StateSpec
 from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.robot import Watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
@@ -856,3 +859,182 @@ def require_said_once(error: str) -> None:
     parts = [part.strip() for part in re.split(r"[;\n]", error) if part.strip()]
     for part, other in itertools.permutations(parts, 2):
         assert part not in other, (part, error)
+
+
+class ArmOfParts:
+    """An arm, or a pair, whose joints and grippers are parts of the state, and which reaches each
+    command at once.
+    """
+
+    parts: tuple[tuple[str, int], ...] = (("joints", 6), ("gripper", 1))
+
+    def __init__(self) -> None:
+        self.pose = np.zeros(sum(size for _, size in self.parts), np.float32)
+
+    def observe(self) -> Obs:
+        state = {}
+        first = 0
+        for name, size in self.parts:
+            state[name] = self.pose[first : first + size].copy()
+            first += size
+        return Obs({"front": np.zeros((32, 32, 3), np.uint8)}, state=state)
+
+    def apply(self, action: np.ndarray) -> None:
+        self.pose = action.copy()
+
+    def stop(self) -> None: ...
+
+
+class Aloha(ArmOfParts):
+    parts = (("left/joints", 6), ("left/gripper", 1), ("right/joints", 6), ("right/gripper", 1))
+
+
+class Released:
+    """A leader that never takes over."""
+
+    def engaged(self) -> bool:
+        return False
+
+    def action(self, obs: Obs) -> np.ndarray:
+        raise AssertionError("the leader is not engaged")
+
+
+PAIR = {
+    "ArmOfParts": Contract(
+        state={"joints": StateSpec(6, "rad"), "gripper": StateSpec(1)},
+        action=ActionSpec(dim=7, space="joint", delta=False, gripper_open=1.0, gripper_closed=0.0),
+        chunk=8,
+    ),
+    "Aloha": Contract(
+        state={name: StateSpec(size) for name, size in Aloha.parts},
+        action=ActionSpec(
+            dim=14,
+            space="joint",
+            delta=False,
+            gripper_open=1.0,
+            gripper_closed=0.0,
+            arms=("left", "right"),
+        ),
+        chunk=8,
+    ),
+}
+MEASURE = {"ArmOfParts": "joints,gripper", "Aloha": ",".join(name for name, _ in Aloha.parts)}
+# A valid value of each option for a robot; None for an option that every run has.
+OPTIONS: dict[str, list[str] | None] = {
+    "--robot": None,
+    "--robot-set": None,  # the classes have no arguments
+    "--instruction": ["stack the cups"],
+    "--seconds": None,
+    "--hz": ["50"],
+    "--real-time": [],
+    "--teleop": [f"{HERE}:Released"],
+    "--step": ["0.01"],
+    "--allow-remote-stop": [],
+    "--record": ["{folder}/recorded"],
+    "--rerun": None,  # needs the library of the viewer
+    "--mode": ["ensemble"],
+    "--execute": ["2"],
+    "--horizon": ["4"],
+    "--merge": ["average"],
+    "--rtc": [],
+    "--max-age-s": ["5"],
+    "--deadline-ms": ["500"],
+    "--safe": ["hold"],
+    "--max-step": ["0.5"],
+    "--limits": ["{folder}/limits.yaml"],
+    "--soft-start-s": ["0"],
+    "--measure": ["{measure}"],
+    "--stats": ["{folder}/stats.json"],
+    "--ignore-mismatch": [],
+    "--silent-s": ["5"],
+    "--restart": ["auto"],
+    "--transport": ["http"],
+    "--timeout-s": ["5"],
+}
+
+
+def test_each_option_for_a_robot_is_run() -> None:
+    _, robot_actions, env_actions = command_parser()
+    options = {action.option_strings[0] for action in robot_actions}
+    both = {"--hz", "--teleop", "--step", "--record", "--rerun", "--mode", "--execute"}
+    assert OPTIONS.keys() == options | both | {"--max-step", "--limits", "--soft-start-s"}
+    assert not OPTIONS.keys() & {action.option_strings[0] for action in env_actions}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("option", [name for name, value in OPTIONS.items() if value is not None])
+@pytest.mark.parametrize("arm", PAIR)
+def test_each_option_suits_one_arm_and_a_pair(
+    served: Callable[..., None],
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    arm: str,
+    option: str,
+) -> None:
+    contract = PAIR[arm]
+    dim = contract.action.dim or 0
+
+    def act(_: Agent, obs: Obs) -> Act:
+        pose = np.concatenate([np.ravel(values) for values in obs.state.values()])
+        return Act(np.tile(pose + np.float32(0.001), (8, 1)))
+
+    served(contract=contract, act=act)
+    ranges = {"min": [-3.0] * dim, "max": [3.0] * dim}
+    (tmp_path / "stats.json").write_text(json.dumps({"action": ranges}))
+    (tmp_path / "limits.yaml").write_text("velocity: 1.0\nacceleration: 50\njerk: 5000")
+    words = ["http://nowhere", "--robot", f"{HERE}:{arm}", "--seconds", "0.1", option]
+    for value in OPTIONS[option] or []:
+        words.append(value.format(folder=tmp_path, measure=MEASURE[arm]))
+    status = drive(words)
+    printed = capsys.readouterr()
+    assert status in (0, 1), printed.err  # 1: a busy machine had ticks without an action
+    assert "rows of the plan per tick: " in printed.out
+    if option != "--measure":
+        assert f"no measured pose: .*; give --measure {MEASURE[arm]}" in printed.out.replace(
+            "the first action is not compared with the pose of the robot, and may be anywhere "
+            "within the limits",
+            ".*",
+        )
+    if option == "--record":
+        assert "recorded: 1 episodes" in printed.out
+        assert "GB free" in printed.out
+
+
+@pytest.mark.parametrize(
+    ("measure", "said"),
+    [
+        ("left/joints,right/joints", None),  # without the grippers
+        ("left/joints,left/gripper,right/joints,right/gripper", None),
+        (
+            "left/joints",
+            r"expected parts with 14 numbers, .*, or 12 without grippers, got 6 in left",
+        ),
+        ("left/joints,left/gripper,right/joints", "got 13 in left/joints .6., left/gripper .1."),
+        ("left/joints,rihgt/joints", "got 'rihgt/joints'; did you mean 'right/joints'"),
+    ],
+)
+def test_the_measured_pose_of_a_pair_has_the_numbers_of_an_action(
+    served: Callable[..., None],
+    capsys: pytest.CaptureFixture[str],
+    measure: str,
+    said: str | None,
+) -> None:
+    served(contract=PAIR["Aloha"], act=lambda *_: Act(np.zeros((8, 14), np.float32)))
+    robot_words = ["--robot", f"{HERE}:Aloha", "--seconds", "0.1", "--max-step", "0.1"]
+    status = drive(["http://nowhere", *robot_words, "--measure", measure])
+    error = capsys.readouterr().err
+    assert (status == 2) == (said is not None), error
+    if said is not None:
+        assert re.search(said, error), error
+        require_said_once(error)
+
+
+def test_a_limit_that_is_exceeded_is_in_the_unit_of_the_contract(
+    served: Callable[..., None], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "limits.yaml").write_text("velocity: 0.5")
+    words = ["--robot", f"{HERE}:ArmOfParts", "--limits", str(tmp_path / "limits.yaml")]
+    rows = np.cumsum(np.full((8, 7), 0.1, np.float32), axis=0)
+    served(contract=PAIR["ArmOfParts"], act=lambda *_: Act(rows))
+    drive(["http://nowhere", *words, "--seconds", "0.2", "--soft-start-s", "0"])
+    assert "expected velocity of at most 0.5 rad/s, got" in capsys.readouterr().out

@@ -80,7 +80,9 @@ UNEQUAL = ActionSpec(
     "use",
     [
         lambda: SafeAction("auto", UNEQUAL),
-        lambda: ChunkExecutor(None, ClockConfig(latency=0.1, hz=10), Contract(action=UNEQUAL)),
+        lambda: ChunkExecutor(
+            None, ClockConfig(latency=0.1), Contract(action=UNEQUAL, control_hz=10)
+        ),
         lambda: Guard(Contract(action=UNEQUAL)),
         lambda: SimulatedRobot(Contract(action=UNEQUAL)),
     ],

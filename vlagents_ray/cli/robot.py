@@ -496,6 +496,10 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
     )
 
     _say_timeliness(report, say)
+    if report.slow is not None:
+        say(report.slow)
+    elif report.rows_per_tick is not None:
+        say(f"rows of the plan per tick: {report.rows_per_tick:.2f}, full speed")
 
     causes = {**report.safe, "waiting": report.waiting}
     for cause, ticks in sorted(causes.items(), key=lambda item: -item[1]):

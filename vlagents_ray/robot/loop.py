@@ -64,6 +64,9 @@ Restart = Literal["manual", "auto"]
 logger = logging.getLogger(__name__)
 
 _COLLECT_S = 2.0
+# The number of rows of the plan per tick below which a report names it: a run of a minute loses
+# less at its beginning.
+_FULL_SPEED = 0.98
 ROBOT = ("observe", "apply", "stop")  # names of the methods of a `Robot`
 
 
@@ -373,6 +376,9 @@ class LoopReport:
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
     outcome: str = ""  # "success" or "failure", if the episode was marked on the live page
+    # The rows of the plan per tick with a row: 1 at full speed, less while the robot begins slowly.
+    # None for an agent without a plan.
+    rows_per_tick: float | None = None
     timeliness: Timeliness = field(default_factory=Timeliness)
 
     @property
@@ -400,6 +406,19 @@ class LoopReport:
             f"the policy hardly drove the robot: {self.safe_ticks} of {ticks} ticks had no action "
             f"of the policy, most often for this reason: {self.reasons.get(cause, cause)}. "
             f"{_cure(cause)}"
+        )
+
+    @property
+    def slow(self) -> str | None:
+        """A sentence with its cure if the robot did not execute the plan at full speed; else
+        None.
+        """
+        rows = self.rows_per_tick
+        if rows is None or rows >= _FULL_SPEED:
+            return None
+        return (
+            f"rows of the plan per tick: {rows:.2f} of 1, as the limits let the robot begin each "
+            "motion slowly; use longer chunks, or wider limits of acceleration and jerk"
         )
 
     @property
@@ -746,6 +765,8 @@ class _Run:
                     self._record(obs, act, action, tick)
                     self.view.add(obs, act, action, tick, work_s[-1])
         finally:
+            if isinstance(self.agent, ChunkPlayer):
+                self.report.rows_per_tick = self.agent.rows_per_tick
             self.report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
             if work_s:
                 self.report.apply_p50_ms = float(np.median(self.apply_s)) * 1e3
