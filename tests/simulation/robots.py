@@ -10,13 +10,16 @@ pace as well.
 from __future__ import annotations
 
 import argparse
+import bisect
 import heapq
 import itertools
 import math
 import random
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 from in_flight import AnySession, message_of_one
 
@@ -24,7 +27,13 @@ from vlagents_ray.protocol.messages import Priority, Request
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.fair_queue import BEHIND_OTHERS_S, PATIENCE_S
 from vlagents_ray.serve.queue.replica_pace import ReplicaPace, RobotPlan
-from vlagents_ray.serve.queue.robots_load import CostCurve
+from vlagents_ray.serve.queue.robots_load import (
+    USABLE,
+    CostCurve,
+    RobotNeed,
+    RobotsLoad,
+    robots_load,
+)
 from vlagents_ray.serve.requests import Origin, PendingRequest
 
 PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled
@@ -68,6 +77,10 @@ class Robot:
     late_s: float = 0.0  # time of its last starved tick, s
     plan: RobotPlan = field(default_factory=RobotPlan)
 
+    def share_in_time(self) -> float:
+        """Return the share of ticks that had an action."""
+        return 1 - self.starved / self.ticks if self.ticks else 0.0
+
 
 @dataclass
 class Simulation:
@@ -107,13 +120,11 @@ class World:
             clock=lambda: self.now,
             poller=_NoFiles(),  # type: ignore[arg-type]
         )
-        self.queue.bind(driven=True)
+        self.queue.bind()
         self.pace = ReplicaPace(
-            self.queue.window.curve,
+            self.queue,
             lambda: [(robot.plan, robot.waiting is not None) for robot in self.robots],
-            LARGEST,
             lambda: self.now,
-            lambda: self.queue.depth_of(Priority.ROBOT),
         )
         self.busy = False
         self.batches: list[int] = []
@@ -201,22 +212,25 @@ class World:
         self._put(pending)
 
     def _put(self, pending: PendingRequest) -> None:
-        costs_s = self.queue.window.costs_s
-        pending.observer_data["patient"] = (
-            pending.priority is Priority.ROBOT
-            and bool(costs_s)
-            and self._can_wait(pending, self.now + 2 * costs_s[-1])
-        )
+        pending.observer_data["class"] = self._class_of(pending)
         self.queue.put(pending)
         if not self.busy:
             self._turn()
 
-    @staticmethod
-    def _can_wait(pending: PendingRequest, urgent_s: float) -> bool:
-        """Return whether a request can wait, if requests needed before `urgent_s` are urgent."""
+    def _class_of(self, pending: PendingRequest) -> int:
+        """Return the class of a request at this time: 0 for urgent robots, 1 for robots that can
+        wait, 2 for displaced robots, 3 for robots without slack, and 4 for simulations.
+        """
+        if pending.priority is Priority.SIMULATION:
+            return 4
+        if self.now - pending.arrived > BEHIND_OTHERS_S:
+            return 0
+        if not pending.needed:
+            return 3
         if pending.waits_behind_others:
-            return pending.arrived + BEHIND_OTHERS_S > urgent_s
-        return pending.needed > urgent_s
+            return 2
+        costs_s = self.queue.window.costs_s
+        return 1 if costs_s and pending.needed > self.now + 2 * costs_s[-1] else 0
 
     def _turn(self) -> None:
         taken = self.queue.take()
@@ -241,28 +255,31 @@ class World:
         assert len({pending.session_id for pending in batch}) == len(batch), (
             "two requests of one session"
         )
-        costs_s = self.queue.window.costs_s
-        if not costs_s:
-            return
-        urgent_s = self.now + 2 * costs_s[-1]
-        left = [
-            pending
-            for pending in self.queue._waiting.heads()
-            if pending.priority is Priority.ROBOT
-            and not self._can_wait(pending, urgent_s)
-            and not pending.over
-            and pending.deadline >= self.now
-        ]
-        patient = [
-            pending
-            for pending in batch
-            if pending.observer_data["patient"] and self._can_wait(pending, urgent_s)
-        ]
-        assert not (left and patient), "an urgent request is behind one that can wait"
+        # The class of a robot that can wait changes as time passes.
+        first_left = min(
+            (
+                max(self._class_of(pending), pending.observer_data["class"])
+                for pending in self.queue._waiting.heads()
+                if not pending.over and pending.deadline >= self.now
+            ),
+            default=4,
+        )
+        classes = sorted(
+            min(self._class_of(pending), pending.observer_data["class"]) for pending in batch
+        )
+        if first_left == 3 and classes[-1] == 4:
+            classes.pop()  # a simulation that has waited for too long
+            assert 4 not in classes, "robots without slack are left out"
+        assert max(classes, default=0) <= first_left, "a later class is served first"
+
+        room = self.queue.room
+        if room is not None and max(classes, default=0) >= 3:
+            # One held request may be added to a batch of robots.
+            most = max(room.beside, bisect.bisect(classes, 2) + 1) if classes[0] < 3 else room.alone
+            assert len(batch) <= most, "the batch is too large for the robots"
 
     def _finish(self, batch: list[PendingRequest], took: float) -> None:
         self.queue.end()
-        self.queue.most_with_others = self.pace.most_with_others
         self.busy = False
         for pending in batch:
             self.answered += 1
@@ -271,13 +288,16 @@ class World:
             if robot is None:
                 pending.observer_data["done"]()
                 continue
-            robot.plan.observe(robot.rows, pending.arrived, pending.needed, self.now)
-            replan_s = self.pace.replan_s(robot.plan) if pending.needed else 0.0
+            replan_s = 0.0
+            if pending.needed:
+                robot.plan.observe(robot.rows, pending.arrived, pending.needed, self.now)
+                replan_s = self.pace.replan_s(robot.plan)
             arrives = self.now + WIRE_S
             robot.inference_s = took
             self.at(
                 arrives, lambda pending=pending, replan_s=replan_s: self._answer(pending, replan_s)
             )
+        self.pace.update()
         self._turn()
 
     def _answer(self, pending: PendingRequest, replan_s: float) -> None:
@@ -297,12 +317,16 @@ class World:
             robot.end, robot.captured = end, captured
 
     def check_all_answered(self) -> None:
-        """Check that no request is lost, and that no simulation waits forever."""
+        """Check that no request is lost, and that no simulation waits forever beside robots without
+        known needs.
+        """
         under_way = sum(robot.waiting is not None for robot in self.robots)
         under_way += len(self.simulations) if self.now > 0.2 else 0
         missing = self.sent - self.answered - self.expired
         assert 0 <= missing <= under_way, f"{missing} requests without an answer, {under_way} sent"
 
+        if any(robot.plan.need is not None for robot in self.robots):
+            return
         # Every second batch has a slot for a simulation that has waited for long.
         longest_batch_s = self.costs.cost_s(LARGEST) * (1 + self.jitter)
         bound_s = PATIENCE_S + 2 * (len(self.simulations) + 1) * longest_batch_s
@@ -311,15 +335,11 @@ class World:
 
     def in_time(self) -> int:
         """Return the robots of which at least 98 % of the ticks had an action."""
-        return sum(
-            robot.ticks > 0 and 1 - robot.starved / robot.ticks >= 0.98 for robot in self.robots
-        )
+        return sum(robot.share_in_time() >= 0.98 for robot in self.robots)
 
     def share(self) -> float:
         """Return the lowest share in time of all robots."""
-        return min(
-            (1 - robot.starved / robot.ticks if robot.ticks else 0.0) for robot in self.robots
-        )
+        return min(robot.share_in_time() for robot in self.robots)
 
     def age_p95_s(self) -> float:
         """Return the 95th percentile of the age of executed actions, in s."""
@@ -427,6 +447,114 @@ def print_fleets() -> None:
             print(f"{name:14} {way:15} {most[way]:7}  {', '.join(in_time)}", flush=True)
 
 
+@dataclass(frozen=True)
+class SharedReplica:
+    """A policy, and the robots that share it with other clients."""
+
+    costs: CostCurve
+    kinds: list[int]  # rows of a chunk, which the robots take in turn
+    hz: float
+    robots: int
+    without_slack: int  # number of robots that declare nothing
+
+    @classmethod
+    def drawn(cls, seed: int) -> SharedReplica:
+        """Draw a replica whose full batches take a part of the shortest chunk."""
+        draw = random.Random(seed)
+        kinds = draw.choice([[8], [50], [8, 50]])
+        hz = draw.choice([5.0, 10.0, 20.0])
+        full_s = min(kinds) / hz * math.exp(draw.uniform(math.log(0.03), 0.0))
+        rows_part = draw.uniform(0.05, 1.0)  # share of a full batch that depends on its rows
+        # A robot is in time alone.
+        full_s *= min(1.0, 0.4 * min(kinds) / hz / (full_s * (1 - rows_part * (1 - 1 / LARGEST))))
+        costs = CostCurve(full_s * (1 - rows_part), full_s * rows_part / LARGEST)
+
+        replica = cls(costs, kinds, hz, 1, draw.choice([0, 0, 4, 16]))
+        target = draw.uniform(0.05, 1.1)
+        while replica.robots < 60:
+            larger = replace(replica, robots=replica.robots + 1)
+            if larger.load > target:
+                break
+            replica = larger
+        return replica
+
+    @cached_property
+    def alone(self) -> RobotsLoad:
+        """The load of the robots alone."""
+        return robots_load(self.costs, self.needs(), LARGEST)
+
+    @property
+    def load(self) -> float:
+        """The load of the robots alone, as a share of the largest usable load."""
+        return self.alone.load / USABLE
+
+    def needs(self) -> Counter[RobotNeed]:
+        """Return the number of robots with each need."""
+        rows = (self.kinds[index % len(self.kinds)] for index in range(self.robots))
+        return Counter(RobotNeed(self.hz, number) for number in rows)
+
+    def is_at_its_limit(self) -> bool:
+        """Return whether robots are late now and then even without other clients: because there are
+        many of them, or because two batches take nearly as long as a half of their chunks.
+        """
+        slowest_s = min(need.slowest_answer_s for need in self.needs())
+        return self.load > 0.9 or self.alone.latency_s > slowest_s
+
+    def run(self, seed: int, simulations: int = 0, *, with_others: bool = False) -> World:
+        """Run the robots until each has executed some chunks, and count a minute of ticks."""
+        robots = fleet(self.robots, *((rows, self.hz) for rows in self.kinds))
+        if with_others:
+            others = fleet(self.without_slack, *((rows, self.hz) for rows in self.kinds))
+            for other in others:
+                other.name, other.states_slack = f"other {other.name}", False
+            robots += others
+        world = World(self.costs, robots, seed=seed, simulations=simulations)
+        world.measured_from = 4 * max(self.kinds) / self.hz + 2
+        return world.run(world.measured_from + MEASURED_S)
+
+
+@dataclass(frozen=True)
+class Beside:
+    """The robots of a shared replica, alone and beside other clients."""
+
+    replica: SharedReplica
+    lost: float  # largest share of ticks in time that a robot loses, from the worst run alone
+    mean_lost: float  # mean share that the robots lose
+    simulations_hz: float  # answers per second of all simulations
+    least_others: float  # lowest share in time of the robots that declare nothing
+
+
+def beside_others(seed: int, simulations: int = 16, *, with_others: bool) -> Beside:
+    """Run the replica of a seed alone, with three random sequences, and beside other clients."""
+    replica = SharedReplica.drawn(seed)
+    alone = [replica.run(seed + 1000 * run).robots for run in range(3)]
+    shared = replica.run(seed, simulations, with_others=with_others)
+    robots, others = shared.robots[: replica.robots], shared.robots[replica.robots :]
+
+    lost, mean_lost = [], 0.0
+    for index, robot in enumerate(robots):
+        shares = [before[index].share_in_time() for before in alone]
+        lost.append(min(shares) - robot.share_in_time())
+        mean_lost += sum(shares) / len(shares) - robot.share_in_time()
+
+    answered = sum(simulation.answered for simulation in shared.simulations)
+    least_others = min((other.share_in_time() for other in others), default=1.0)
+    return Beside(replica, max(lost), mean_lost / len(robots), answered / shared.now, least_others)
+
+
+def print_beside(first: int, seeds: int, with_others: bool) -> None:
+    """Print the ticks that robots lose beside other clients, and the service of these."""
+    print("seed robots  load  most lost, mean lost %  simulations/s  least of others %")
+    for seed in range(first, first + seeds):
+        beside = beside_others(seed, with_others=with_others)
+        print(
+            f"{seed:4} {beside.replica.robots:6} {beside.replica.load:5.2f} "
+            f"{100 * beside.lost:10.2f} {100 * beside.mean_lost:10.2f} "
+            f"{beside.simulations_hz:14.1f} {100 * beside.least_others:8.1f}",
+            flush=True,
+        )
+
+
 def drawn(seed: int) -> World:
     """Return a random world of a few seconds: robots that obey and that do not, robots with false
     claims, simulations, and deadlines.
@@ -478,7 +606,16 @@ def main() -> None:
     parser.add_argument(
         "--starts", action="store_true", help="print fleets whose robots all start at once"
     )
+    parser.add_argument(
+        "--beside", action="store_true", help="print what the robots of seeds lose beside others"
+    )
+    parser.add_argument(
+        "--others", action="store_true", help="with --beside: also robots that send no slack"
+    )
     options = parser.parse_args()
+    if options.beside:
+        print_beside(options.first, options.seeds, options.others)
+        return
 
     began = time.monotonic()
     answered = 0

@@ -61,6 +61,12 @@ def test_a_wrong_slack_is_refused(engine: Engine, wrong: Any) -> None:
         checked(engine, "a", Request("act", Obs(info={SLACK: wrong})), ignore)
 
 
+def test_the_slack_of_a_simulation_does_not_count(engine: Engine) -> None:
+    reset(engine, "a")
+    request = Request("act", Obs(info={SLACK: 250}), priority="simulation")
+    assert checked(engine, "a", request, ignore).needed == 0.0
+
+
 def test_an_answer_is_needed_when_the_slack_is_over_or_the_deadline(engine: Engine) -> None:
     reset(engine, "a")
     pending = checked(engine, "a", Request("act", Obs(info={SLACK: 250})), ignore)
@@ -81,7 +87,7 @@ def test_robots_of_a_busy_replica_are_told_when_to_replan(engine: Engine) -> Non
     for name in names:
         reset(engine, name, hz=10)
     act(engine, names[0], slack_ms=2000.0)
-    engine.pace._curve = lambda: CostCurve(row_s=0.005)
+    engine.queue.curve = lambda: CostCurve(row_s=0.005)  # type: ignore[method-assign]
     engine.pace._read = -math.inf  # as if half a second had passed
     replan_ms = act(engine, names[0], slack_ms=2000.0).info[REPLAN]
     # 400 robots with 5 ms each.
@@ -122,7 +128,7 @@ def test_the_needs_of_a_robot_move_with_its_session_and_end_with_its_episode(
 
 
 def test_the_newest_episodes_wait_behind_others_if_there_are_too_many(engine: Engine) -> None:
-    engine.pace._curve = lambda: CostCurve(row_s=0.005)
+    engine.queue.curve = lambda: CostCurve(row_s=0.005)  # type: ignore[method-assign]
     for number in range(9):
         reset(engine, f"robot{number}", hz=2000)
     engine.pace.load()
@@ -134,9 +140,12 @@ def test_the_newest_episodes_wait_behind_others_if_there_are_too_many(engine: En
     assert wait == sorted(wait)
     assert (wait[0], wait[-1]) == (False, True)
 
-    assert engine.queue.most_with_others == math.inf
-    act(engine, "robot0", slack_ms=250.0)
-    assert engine.queue.most_with_others == engine.pace.most_with_others < math.inf
+    assert engine.queue.room is not None
+    for number in range(9):
+        engine.sessions.close(f"robot{number}")
+    engine.pace._read = -math.inf  # as if half a second had passed
+    reset(engine, "last")
+    assert engine.queue.room is None
 
 
 def test_the_costs_of_batches_are_measured(engine: Engine) -> None:

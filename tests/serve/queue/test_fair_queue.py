@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import time
 from collections import Counter, defaultdict
@@ -20,6 +21,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.fair_queue import BEHIND_OTHERS_S, PATIENCE_S, FairQueue
+from vlagents_ray.serve.queue.robots_load import IDLE, Room
 from vlagents_ray.serve.requests import Origin, PendingRequest
 
 
@@ -239,8 +241,15 @@ def test_the_time_spent_waiting_for_requests_counts_as_idle() -> None:
 def behind(session: str, *, arrived: float = 0.0) -> PendingRequest:
     """Return the request of a robot that is about to run out of rows, but waits behind others."""
     request = ticket(session, priority=Priority.ROBOT, arrived=arrived)
-    request.needed = arrived
+    request.needed = arrived + 1e-3
     request.waits_behind_others = True
+    return request
+
+
+def urgent(session: str, *, arrived: float = 0.0) -> PendingRequest:
+    """Return the request of a robot that is about to run out of rows."""
+    request = ticket(session, priority=Priority.ROBOT, arrived=arrived)
+    request.needed = arrived + 1e-3
     return request
 
 
@@ -253,41 +262,81 @@ def test_robots_of_the_newest_episodes_wait_behind_all_others() -> None:
         behind("late1"),
         behind("late2"),
         patient,
-        ticket("urgent", priority=Priority.ROBOT),
+        ticket("without slack", priority=Priority.ROBOT),
+        urgent("urgent"),
         ticket("env"),
     ):
         waiting.add(request)
-    order = [taken(waiting, 1)[0] for _ in range(5)]
-    assert order == ["urgent", "patient", "late1", "late2", "env"]
+    order = [taken(waiting, 1)[0] for _ in range(6)]
+    assert order == ["urgent", "patient", "late1", "late2", "without slack", "env"]
 
 
-@pytest.mark.parametrize("others", range(5))
-@pytest.mark.parametrize("most_with_others", range(1, 5))
-def test_a_batch_is_filled_up_to_its_limit_with_robots_that_wait_behind_others(
-    others: int, most_with_others: int
+@pytest.mark.parametrize("first", range(5))
+@pytest.mark.parametrize("displaced", [0, 2])
+@pytest.mark.parametrize(("alone", "beside"), [(0, 0), (0, 3), (2, 2), (4, 4)])
+@pytest.mark.parametrize("kind", [Priority.ROBOT, Priority.SIMULATION])
+def test_a_batch_is_filled_up_to_the_room_that_robots_leave(
+    first: int, displaced: int, alone: int, beside: int, kind: Priority
 ) -> None:
     waiting = FairQueue()
     waiting.costs_s = (0.0, 0.05, 0.05, 0.05, 0.05)
+    waiting.room = Room(3, alone, beside, 5.0, IDLE)
+    waiting._held_until = math.inf
     for number in range(4):
-        waiting.add(behind(f"late{number}"))
-    for number in range(others):
-        waiting.add(ticket(f"urgent{number}", priority=Priority.ROBOT))
+        waiting.add(ticket(f"other{number}", priority=kind))
+    for number in range(displaced):
+        waiting.add(behind(f"displaced{number}"))
+    for number in range(first):
+        waiting.add(urgent(f"urgent{number}"))
 
-    batch, _ = waiting.take(4, 0.0, most_with_others)
-    assert len(batch) == max(others, most_with_others)
-    assert sum(request.waits_behind_others for request in batch) == max(
-        0, most_with_others - others
-    )
+    batch, _ = waiting.take(4, 0.0)
+    robots = max(first, min(3, first + displaced))
+    most = alone if robots == 0 else beside
+    expected = robots if robots < first + displaced else max(robots, most)
+    assert len(batch) == expected
 
 
-def test_no_robot_waits_behind_others_for_ever() -> None:
+def test_a_held_request_is_added_to_a_batch_of_robots_now_and_then() -> None:
+    waiting = FairQueue()
+    waiting.costs_s = (0.0, 0.05, 0.06, 0.07, 0.08)
+    waiting.room = Room(4, 0, 0, 5.0, IDLE)
+    now, held = 0.0, 0
+    for number in range(16):
+        waiting.add(ticket(f"env{number}"))
+    while now < 100.0:
+        assert waiting.is_held(now)
+        assert waiting.take(4, now) == ([], [])
+        waiting.add(urgent("robot", arrived=now))
+        assert not waiting.is_held(now)
+        names = taken(waiting, 4, now)
+        assert names[0] == "robot"
+        held += len(names) - 1
+        for name in names[1:]:
+            waiting.add(ticket(name, arrived=now))
+        now += waiting.costs_s[len(names)]
+    assert 19 <= held <= 21, "one in 5 s"
+
+
+def test_requests_are_no_longer_held_when_the_robots_have_left() -> None:
+    waiting = filled(ticket("env"))
+    waiting.costs_s = (0.0, 0.05)
+    waiting.room = Room(1, 0, 0, 5.0, IDLE)
+    assert waiting.is_held(0.0)
+    assert waiting.had_others()
+    waiting.room = None
+    assert not waiting.is_held(0.0)
+    assert taken(waiting, 1) == ["env"]
+
+
+@pytest.mark.parametrize("has_slack", [True, False])
+def test_no_robot_waits_behind_others_for_ever(has_slack: bool) -> None:
     waiting = FairQueue()
     waiting.costs_s = (0.0, 0.05)
-    waiting.add(behind("late"))
+    waiting.add(behind("late") if has_slack else ticket("late", priority=Priority.ROBOT))
     answered = []
     for second in range(1, 70):
-        waiting.add(ticket(f"urgent{second}", priority=Priority.ROBOT, arrived=float(second)))
-        waiting.add(ticket(f"also{second}", priority=Priority.ROBOT, arrived=float(second)))
+        waiting.add(urgent(f"urgent{second}", arrived=float(second)))
+        waiting.add(urgent(f"also{second}", arrived=float(second)))
         answered += [(name, second) for name in taken(waiting, 1, now=float(second))]
         answered += [(name, second) for name in taken(waiting, 1, now=float(second))]
     [when] = [second for name, second in answered if name == "late"]

@@ -2,15 +2,38 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 
 from vlagents_ray.serve.queue.replica_pace import ReplicaPace, RobotPlan
-from vlagents_ray.serve.queue.robots_load import USABLE, CostCurve, RobotNeed, robots_load
+from vlagents_ray.serve.queue.robots_load import (
+    USABLE,
+    CostCurve,
+    RobotNeed,
+    Room,
+    robots_load,
+)
 
 PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled
 OF_50, OF_8 = RobotNeed(10.0, 50), RobotNeed(10.0, 8)
+
+
+class Queue:
+    """The queue of a replica whose batches take as long as those of π0."""
+
+    def __init__(self) -> None:
+        self.largest = 16
+        self.room: Room | None = None
+        self.waiting = 0
+        self.others = False
+
+    def had_others(self) -> bool:
+        return self.others
+
+    def curve(self) -> CostCurve:
+        return PI0
+
+    def depth_first(self) -> int:
+        return self.waiting
 
 
 class Robots:
@@ -19,11 +42,9 @@ class Robots:
     def __init__(self, *plans: RobotPlan) -> None:
         self.plans = list(plans)
         self.now = 100.0
-        self.waiting = 0
         self.requests: list[RobotPlan] = []  # plans of robots whose requests wait
-        self.pace = ReplicaPace(
-            lambda: PI0, self._plans, 16, lambda: self.now, lambda: self.waiting
-        )
+        self.queue = Queue()
+        self.pace = ReplicaPace(self.queue, self._plans, lambda: self.now)
 
     def _plans(self) -> list[tuple[RobotPlan, bool]]:
         waiting = {id(plan) for plan in self.requests}
@@ -67,12 +88,42 @@ def test_a_robot_comes_first_when_another_one_has_left() -> None:
 
 def test_batches_are_not_filled_so_far_that_the_first_robots_are_late() -> None:
     robots = Robots(*plans(OF_8, 30))
-    robots.read()
-    assert robots.pace.most_with_others == math.inf
     robots.plans += plans(OF_8, 40, began=100.0)
     first = robots.read().count(False)
     size = robots_load(PI0, {OF_8: first}, 16).batch_size
-    assert robots.pace.most_with_others == size < 16
+    assert robots.queue.room is not None
+    assert robots.queue.room.displaced == size < 16
+
+
+@pytest.mark.parametrize("need", [OF_8, OF_50, RobotNeed(10.0, 4), RobotNeed(10.0, 1)])
+@pytest.mark.parametrize("number", [1, 4, 16, 30, 300])
+def test_other_clients_get_the_room_in_which_robots_are_in_time(
+    need: RobotNeed, number: int
+) -> None:
+    robots = Robots(*plans(need, number))
+    first = robots.read().count(False)
+    room = robots.queue.room
+    assert room is not None
+    assert 0 <= room.alone <= room.beside <= 16
+    if room.alone:
+        assert 2 * PI0.cost_s(room.alone) <= need.longest_s
+        assert first / need.longest_s * PI0.cost_s(room.alone) / room.alone < USABLE
+    elif room.beside:
+        assert number == 1
+        assert PI0.cost_s(room.beside) <= need.longest_s
+    if number == 1:
+        assert room.beside > 0, "a lone robot shares its batches"
+
+
+def test_the_pace_beside_other_clients_allows_for_their_larger_batches() -> None:
+    latencies_s = []
+    for others in (False, True):
+        robots = Robots(*plans(OF_8, 2))
+        robots.queue.others = others
+        robots.read()
+        latencies_s.append(robots.pace.load().latency_s)
+    alone_s, beside_s = latencies_s
+    assert beside_s > alone_s
 
 
 @pytest.mark.parametrize("greedy", [RobotNeed(100.0, 1), RobotNeed(1000.0, 80)])
@@ -107,7 +158,7 @@ def test_a_robot_whose_rate_is_unknown_waits_until_the_others_are_answered() -> 
     robots = Robots(plan)
     plan.observe(50, arrived=robots.now, needed=robots.now, now=robots.now)
     assert robots.pace.replan_s(plan) == 0.0
-    robots.waiting = 160
+    robots.queue.waiting = 160
     assert robots.pace.replan_s(plan) == pytest.approx(10 * PI0.cost_s(16))
 
 
@@ -161,4 +212,14 @@ def test_nothing_remains_of_a_fleet_that_was_too_large() -> None:
     robots.read()
     robots.plans = [RobotPlan(began=1000.0)]
     robots.read()
-    assert (robots.pace.needed(), robots.pace.most_with_others) == (0.0, math.inf)
+    assert (robots.pace.needed(), robots.queue.room) == (0.0, None)
+
+
+def test_the_room_of_robots_that_have_left_is_free_after_the_next_batch() -> None:
+    robots = Robots(*plans(OF_8, 30))
+    robots.read()
+    assert robots.queue.room is not None
+    robots.plans = []
+    robots.now += 1.0
+    robots.pace.update()
+    assert robots.queue.room is None

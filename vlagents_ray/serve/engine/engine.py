@@ -16,7 +16,6 @@ from typing import Any
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import OutcomeUnknown, PolicyUnavailable
 from vlagents_ray.interface import Agent
-from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.background_calls import BackgroundCalls
 from vlagents_ray.serve.engine.health import Health
@@ -105,13 +104,7 @@ class Engine:
         )
         self.admission = Admission(settings.in_flight_bytes, self.queue.window)
 
-        self.pace = ReplicaPace(
-            self.queue.window.curve,
-            self._plans,
-            settings.max_batch_size,
-            clock,
-            lambda: self.queue.depth_of(Priority.ROBOT),
-        )
+        self.pace = ReplicaPace(self.queue, self._plans, clock)
 
         parts = EngineParts(
             settings=settings,

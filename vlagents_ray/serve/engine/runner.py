@@ -231,6 +231,7 @@ class Runner:
             self._intake.fail(pending, _not_taken(pending, self._clock()))
         if not taken.batch:
             self._sessions.drop_idle()
+            self._pace.update()
             return
         self._queue.begin(taken.batch)
         try:
@@ -245,6 +246,7 @@ class Runner:
                 failed = PolicyFailed(f"the policy raised {type(error).__name__}")
                 self._intake.fail(pending, failed)
         self._queue.end()
+        self._pace.update()
 
     def _run(self, batch: Sequence[PendingRequest]) -> None:
         acting: dict[tuple[LoadedModel, WeightsVersion], list[Acting]] = {}
@@ -497,7 +499,6 @@ class Runner:
         plan.observe(len(act.rows()), pending.arrived, pending.needed, self._clock())
         if pending.needed:
             replan_s = self._pace.replan_s(plan)
-            self._queue.most_with_others = self._pace.most_with_others
             if replan_s > 0:
                 act.info[REPLAN] = replan_s * 1e3
 

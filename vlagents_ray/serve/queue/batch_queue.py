@@ -14,7 +14,6 @@ how long. `patience=0` disables this.
 
 from __future__ import annotations
 
-import math
 import os
 import threading
 import time
@@ -26,10 +25,14 @@ from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.queue.batch_window import BatchWindow
 from vlagents_ray.serve.queue.fair_queue import FairQueue
 from vlagents_ray.serve.queue.poller import Poller
+from vlagents_ray.serve.queue.robots_load import CostCurve, Room
 from vlagents_ray.serve.requests import PendingRequest
 
 _SPIN_S = 100e-6  # time for which the thread polls for the next request before it sleeps
 _LONG_BATCH_S = 0.5  # duration of a batch after which another thread always polls, s
+# Time for which the thread sleeps while requests are held, s. Then the needs of robots are read
+# again, since a robot may have left.
+_HELD_S = 0.5
 # Interval between two requests below which the next request is expected after the same interval.
 _DENSE_S = 500e-6
 
@@ -74,9 +77,6 @@ class BatchQueue:
     ) -> None:
         self._clock, self._idle_s = clock, idle_s
         self.largest = max_batch_size
-        # The size up to which batches are filled with requests that wait behind the requests of
-        # other robots.
-        self.most_with_others: float = math.inf
         self._waiting = FairQueue()
 
         self._load_timer = LoadTimer()  # the time until the policy is loaded counts as idle
@@ -163,7 +163,7 @@ class BatchQueue:
             self._interrupted = False
             if self._closed:
                 return None
-            batch, expired = self._waiting.take(self.largest, now, self.most_with_others)
+            batch, expired = self._waiting.take(self.largest, now)
             if batch:
                 self.window.record_start(batch)
         return Taken(batch, expired)
@@ -214,6 +214,30 @@ class BatchQueue:
         """
         return self.window.slow and self._waiting.sessions >= self.largest
 
+    @property
+    def room(self) -> Room | None:
+        """The room that robots leave in batches to other requests, see `FairQueue`."""
+        return self._waiting.room
+
+    @room.setter
+    def room(self, room: Room | None) -> None:
+        with self._lock:
+            self._waiting.room = room
+
+    def had_others(self) -> bool:
+        """Return whether requests waited behind robots since the last call, see `FairQueue`."""
+        with self._lock:
+            return self._waiting.had_others()
+
+    def curve(self) -> CostCurve | None:
+        """Return the measured durations of batches; None before the first batch."""
+        return self.window.curve()
+
+    def depth_first(self) -> int:
+        """Return the number of sessions whose requests wait behind no other class of requests."""
+        with self._lock:
+            return self._waiting.first
+
     def depth(self) -> int:
         """Return the number of requests that wait for the next batch."""
         return self._waiting.size
@@ -254,35 +278,43 @@ class BatchQueue:
             self.poller.wake()
 
     def _wait_for_request(self) -> bool:
-        """Poll the watched files until a request waits or the queue is closed; return False after
-        `idle_s` without events.
+        """Poll the watched files until a request waits that is not held, or the queue is closed;
+        return False after `idle_s` without events, or soon if requests are held.
         """
         while True:
             with self._lock:
-                ready = self._closed or self._interrupted or self._waiting.size > 0
+                is_held = self._waiting.is_held(self._clock())
+                ready = self._is_ready(is_held)
                 self._asleep = not ready
-            had_event = self.poller.poll(0.0) if ready else self._wait_for_event()
+            had_event = self.poller.poll(0.0) if ready else self._wait_for_event(is_held)
             self._asleep = False
-            if ready or self._waiting.size > 0 or self._closed or self._interrupted:
+            if ready:
                 return True
+            with self._lock:
+                if self._is_ready(self._waiting.is_held(self._clock())):
+                    return True
             if not had_event:
                 return False
 
-    def _wait_for_event(self) -> bool:
+    def _is_ready(self, is_held: bool) -> bool:
+        """Return whether `next` must return. The caller holds the lock."""
+        return self._closed or self._interrupted or (self._waiting.size > 0 and not is_held)
+
+    def _wait_for_event(self, is_held: bool) -> bool:
         """Wait for a watched file or a wake-up call; return False if there was none within
-        `idle_s`.
+        `idle_s`, or soon if the waiting requests are held. The thread does not count as idle then.
 
         If the last request followed quickly, the thread polls for `_SPIN_S` before it sleeps, since
         waking up takes as long as a fast policy. While it polls, it yields the core to other
         processes.
         """
-        begun = self._load_timer.mark_idle()
+        begun = time.perf_counter() if is_held else self._load_timer.mark_idle()
         while self._dense and time.perf_counter() - begun < _SPIN_S:
             if self.poller.poll(0.0):
                 self._load_timer.mark_busy()
                 return True
             os.sched_yield()
-        had_event = self.poller.poll(self._idle_s)
+        had_event = self.poller.poll(min(self._idle_s, _HELD_S) if is_held else self._idle_s)
         self._dense = self._load_timer.mark_busy() - begun < _DENSE_S
         return had_event
 

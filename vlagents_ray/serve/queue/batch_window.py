@@ -37,7 +37,9 @@ _KEPT = 0.95  # factor by which the weight of a batch decreases with each later 
 _SPREAD = 0.01  # variance of the batch sizes below which the fixed cost cannot be estimated
 _NEWEST = 0.25  # weight of the last batch in the mean duration of batches
 _NEWEST_OF_SIZE = 0.1  # weight of the last batch in the mean duration of the batches of one size
-_CURVE_BATCHES = 32  # number of batches after which the curve of durations is computed again
+# Number of batches after which the curve of durations is computed again, unless a batch has a new
+# size.
+_CURVE_BATCHES = 32
 # Longest wait of robots for one another, as a share of the last batch's duration. One batch usually
 # saves less than that; the limit matters while the fixed cost is not known. It is larger than
 # `patience`, since eight robots of one process return within 30 ms.
@@ -75,14 +77,18 @@ class BatchCost:
         self._sums = (0.0, 0.0, 0.0, 0.0, 0.0)
         self._means_s: dict[int, float] = {}  # mean duration by size, s
 
-    def add(self, size: int, duration: float) -> None:
-        """Add a batch of `size` observations that took `duration` s."""
+    def add(self, size: int, duration: float) -> bool:
+        """Add a batch of `size` observations that took `duration` s; return whether it is the first
+        one of its size.
+        """
         new = (1.0, size, duration, size * size, size * duration)
         self._sums = tuple(  # type: ignore[assignment]
             _KEPT * total + term for total, term in zip(self._sums, new, strict=True)
         )
+        is_new = size not in self._means_s
         mean_s = self._means_s.get(size, duration)
         self._means_s[size] = mean_s + _NEWEST_OF_SIZE * (duration - mean_s)
+        return is_new
 
     def fixed_s(self) -> float:
         """Return the fixed cost of a batch, s; `inf` until batches of different sizes were
@@ -94,8 +100,9 @@ class BatchCost:
     def curve(self, largest: int) -> CostCurve | None:
         """Return the durations up to batches of size `largest`; None if no batch was added.
 
-        Until a batch of the largest size has run, its duration is computed from the line. If all
-        batches had one size, further rows count as free, until larger batches show their cost.
+        Until a batch of the largest size, or of one row, has run, its duration is computed from the
+        line. If all batches had one size, further rows count as free, and fewer rows as
+        proportionally faster, until batches of other sizes show their cost.
         """
         if not self._means_s:
             return None
@@ -104,6 +111,11 @@ class BatchCost:
         if line is not None and largest not in durations_s:
             fixed_s, row_s = line
             durations_s[largest] = fixed_s + row_s * largest
+        if 1 not in durations_s:
+            smallest = min(self._means_s)
+            most_s = durations_s[smallest]
+            one_s = 0.0 if line is None else line[0] + line[1]
+            durations_s[1] = min(max(most_s / smallest, one_s), most_s)
 
         table: list[tuple[int, float]] = []
         longest_s = 0.0
@@ -176,9 +188,9 @@ class BatchWindow:
         self.slow = self._mean_s > SLOW_S
         self._last.ended, self._duration = now, duration
         if self._last.acts:
-            self._cost.add(self._last.acts, duration)
+            is_new = self._cost.add(self._last.acts, duration)
             self._until_curve -= 1
-            if self._until_curve < 0:
+            if is_new or self._until_curve < 0:
                 self._draw_curve()
 
     def curve(self) -> CostCurve | None:
@@ -202,11 +214,11 @@ class BatchWindow:
         return {"fixed_ms": fixed_ms, "row_ms": row_ms, "ms_by_size": table}
 
     def _draw_curve(self) -> None:
-        """Compute the curve of durations again, more often at the beginning."""
+        """Compute the curve of durations again."""
         self._curve = self._cost.curve(self._size)
         if self._curve is None:
             return
-        self._until_curve = _CURVE_BATCHES if len(self._curve.table) > 1 else 0
+        self._until_curve = _CURVE_BATCHES
         self.costs_s = [0.0, *(self._curve.cost_s(size) for size in range(1, self._size + 1))]
 
     def record_arrival(self, pending: PendingRequest) -> None:

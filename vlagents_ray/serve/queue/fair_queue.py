@@ -1,27 +1,33 @@
 """The order in which waiting requests enter batches. The module uses no threads, and no clock
 except the requests' arrival times.
 
-Robots are served before simulations. Among requests of the same priority the *sources* take turns
+Robots are served before simulations. Among requests of the same class the *sources* take turns
 (round-robin): a connection that sends 512 observations at once gets one slot, then the next source
 gets one, and so on until the batch is full. A client with many requests therefore delays the other
-clients of its priority by at most one batch, and a single client can fill the batch. A session (one
+clients of its class by at most one batch, and a single client can fill the batch. A session (one
 robot, one env) has at most one request in a batch, and its requests keep their order.
 
 A robot that executes an action chunk can send its slack: the time until its rows run out
 (`PendingRequest.needed`). A robot with a long slack waits behind *urgent* robots, which need their
-answers within the duration of two full batches or send no slack. Urgent robots take turns. The
-other robots follow in the order in which they need their answers, and become urgent as that time
-approaches. A client therefore gains nothing if it sends less slack than it has. No request that can
-wait, and no simulation, is added to a batch if its row alone would make the most urgent answer
-late.
+answers within the duration of two full batches. Urgent robots take turns. The other robots follow
+in the order in which they need their answers, and become urgent as that time approaches. A client
+therefore gains nothing if it sends less slack than it has. No request that can wait is added to a
+batch if its row alone would make the most urgent answer late.
 
-If the robots need more than the replica can compute, the robots of the newest episodes
-(`PendingRequest.waits_behind_others`) wait behind all other robots, but at most for
-`BEHIND_OTHERS_S`.
+The other requests get what these robots leave. First come *displaced* robots: if the robots need
+more than the replica can compute, the robots of the newest episodes wait behind all other robots
+with slack (`PendingRequest.waits_behind_others`). Then come robots that send no slack, then
+simulations. No request of a later class enters a batch from which a request of an earlier class is
+left out. While the needs of robots are known, `FairQueue.room` limits the batches with requests of
+later classes: the next request of a robot may arrive as soon as such a batch has begun, and then
+waits for its end. If a batch of a single such request would make a robot late, these requests are
+held until the robots leave, except for a few that are added to batches of robots
+(`Room.held_s`).
 
-Robots may use the whole throughput of the policy. Simulations then advance slowly: once the request
-of the next simulation has waited for longer than `PATIENCE_S`, it gets a slot in every second
-batch.
+There are two further exceptions, so that no class waits forever. The request of a robot becomes
+urgent after `BEHIND_OTHERS_S`. Robots without slack may use the whole throughput that other robots
+leave: once the next simulation has waited for longer than `PATIENCE_S`, it gets a slot before them
+in every second batch.
 """
 
 from __future__ import annotations
@@ -33,31 +39,37 @@ from collections import deque
 from collections.abc import Sequence
 
 from vlagents_ray.protocol.messages import Priority
+from vlagents_ray.serve.queue.robots_load import Room
 from vlagents_ray.serve.requests import PendingRequest
 
-# Time after which a simulation gets a slot although robots' requests keep arriving, s.
+# Time after which a simulation gets a slot although requests of robots without slack keep arriving,
+# s.
 PATIENCE_S = 1.0
 # Maximum time for which the request of a robot waits behind the requests of other robots, s.
 BEHIND_OTHERS_S = 60.0
-
 # Requests of one session, in order; never empty while the session waits.
 _SessionQueue = deque[PendingRequest]
 
 
 class _SourceQueue:
-    """The sources of one priority in round-robin order, each with its waiting sessions."""
+    """The sources of one class of requests in round-robin order, each with its waiting sessions."""
 
-    __slots__ = ("queues", "sources")
+    __slots__ = ("_length", "queues", "sources")
 
     def __init__(self) -> None:
         self.sources: deque[str] = deque()
         self.queues: dict[str, deque[_SessionQueue]] = {}
+        self._length = 0  # number of sessions
+
+    def __len__(self) -> int:
+        return self._length
 
     def add(self, queue: _SessionQueue) -> None:
         """Add the queue of a session that did not wait before, behind all other sessions of its
         source.
         """
         source = queue[0].origin.connection or queue[0].session_id
+        self._length += 1
         queues = self.queues.get(source)
         if queues is None:
             self.queues[source] = deque((queue,))
@@ -69,6 +81,7 @@ class _SourceQueue:
         """Return the next session of the next source, and move that source to the end of the
         order.
         """
+        self._length -= 1
         source = self.sources.popleft()
         queues = self.queues[source]
         queue = queues.popleft()
@@ -79,12 +92,12 @@ class _SourceQueue:
             del self.queues[source]
         return queue
 
-    def is_impatient(self, now: float) -> bool:
-        """Return whether the next request has waited for longer than `PATIENCE_S`."""
+    def is_impatient(self, now: float, patience_s: float) -> bool:
+        """Return whether the next request has waited for longer than `patience_s`."""
         if not self.sources:
             return False
         next_queue = self.queues[self.sources[0]][0]
-        return now - next_queue[0].arrived > PATIENCE_S
+        return now - next_queue[0].arrived > patience_s
 
 
 class _PatientQueue:
@@ -102,26 +115,28 @@ class _PatientQueue:
 
     def add(self, queue: _SessionQueue) -> None:
         """Add the queue of a session that did not wait before."""
-        heapq.heappush(self._heap, (_needed(queue[0]), next(self._numbers), queue))
+        heapq.heappush(self._heap, (queue[0].needed, next(self._numbers), queue))
 
     def next(self) -> _SessionQueue:
         """Remove and return the session whose answer is needed first."""
         return heapq.heappop(self._heap)[2]
-
-    def is_behind_others(self) -> bool:
-        """Return whether the next session waits behind other robots."""
-        return bool(self._heap) and self._heap[0][2][0].waits_behind_others
 
     def first_needed(self) -> float:
         """Return the time at which the first answer is needed, s; `inf` if no session waits."""
         return self._heap[0][0] if self._heap else math.inf
 
 
-def _needed(pending: PendingRequest) -> float:
-    """Return the time before which a robot's request should be answered, s."""
-    if pending.waits_behind_others:
-        return pending.arrived + BEHIND_OTHERS_S
-    return pending.needed
+def _has_slack(pending: PendingRequest) -> bool:
+    """Return whether a robot has sent its slack. The requests other than acts never contain it, and
+    are urgent.
+    """
+    return pending.needed > 0.0 or pending.request.op != "act"
+
+
+def _is_served_first(pending: PendingRequest) -> bool:
+    """Return whether a request waits behind no other class of requests."""
+    is_robot = pending.priority is Priority.ROBOT
+    return is_robot and not pending.waits_behind_others and _has_slack(pending)
 
 
 class FairQueue:
@@ -131,12 +146,20 @@ class FairQueue:
 
     costs_s: Sequence[float] = ()
     """The duration of a batch by its number of requests, s, from 0 to the largest number. It is
-    empty if the durations are unknown; all robots are then urgent.
+    empty if the durations are unknown; all robots with slack are then urgent.
+    """
+    room: Room | None = None
+    """The largest batches with requests of the later classes with which the robots whose needs are
+    known are in time; None if no robot has known needs.
     """
 
     def __init__(self) -> None:
-        self._queues_by_priority = [_SourceQueue() for _ in Priority]
+        # The classes of requests, in the order in which they enter a batch.
+        self._urgent = _SourceQueue()
         self._patient = _PatientQueue()
+        self._displaced = _SourceQueue()
+        self._without_slack = _SourceQueue()
+        self._simulations = _SourceQueue()
         self._sessions: dict[str, _SessionQueue] = {}
         # The waiting request if there is only one; it is not in a session's queue.
         self._lone: PendingRequest | None = None
@@ -144,6 +167,9 @@ class FairQueue:
         # Number of waiting requests by priority, including requests that are over.
         self.depth = [0] * len(Priority)
         self.size = 0  # number of waiting requests of all priorities
+        # Whether a batch had robots without slack or simulations since `had_others`.
+        self._had_others = False
+        self._held_until = -math.inf  # time at which a held request is added to a batch, s
 
     def __contains__(self, session_id: str) -> bool:
         self._enqueue_lone()
@@ -153,6 +179,30 @@ class FairQueue:
     def sessions(self) -> int:
         """Number of sessions with waiting requests."""
         return len(self._sessions) + (self._lone is not None)
+
+    @property
+    def first(self) -> int:
+        """Number of sessions of robots that wait behind no other class of requests."""
+        self._enqueue_lone()
+        return len(self._urgent) + len(self._patient)
+
+    def had_others(self) -> bool:
+        """Return whether there were requests of robots without slack or of simulations since the
+        last call.
+        """
+        self._enqueue_lone()
+        had_others = self._had_others or bool(self._without_slack or self._simulations)
+        self._had_others = False
+        return had_others
+
+    def is_held(self, now: float) -> bool:
+        """Return whether all waiting requests are held, since a batch of a single one would make a
+        robot late.
+        """
+        if self.room is None or self.room.alone > 0:
+            return False
+        is_other = self.first == 0 and not self._displaced
+        return is_other and not self._without_slack.is_impatient(now, BEHIND_OTHERS_S)
 
     def heads(self) -> list[PendingRequest]:
         """Return the next request of each session."""
@@ -186,12 +236,16 @@ class FairQueue:
     def _enqueue(self, queue: _SessionQueue, now: float) -> None:
         """Add the queue of a session that did not wait before."""
         head = queue[0]
-        # For a request without slack, the time is 0.0.
-        can_wait = head.priority is Priority.ROBOT and _needed(head) > now + self._urgent_s()
-        if can_wait:
+        if head.priority is Priority.SIMULATION:
+            self._simulations.add(queue)
+        elif not _has_slack(head):
+            self._without_slack.add(queue)
+        elif head.waits_behind_others:
+            self._displaced.add(queue)
+        elif head.needed > now + self._urgent_s():
             self._patient.add(queue)
         else:
-            self._queues_by_priority[head.priority].add(queue)
+            self._urgent.add(queue)
 
     def _urgent_s(self) -> float:
         """Return the slack up to which a robot is urgent, s: the duration of two full batches, the
@@ -199,16 +253,12 @@ class FairQueue:
         """
         return 2 * self.costs_s[-1] if self.costs_s else math.inf
 
-    def take(
-        self, size: int, now: float, most_with_others: float = math.inf
-    ) -> tuple[list[PendingRequest], list[PendingRequest]]:
+    def take(self, size: int, now: float) -> tuple[list[PendingRequest], list[PendingRequest]]:
         """Take the next batch of at most `size` requests.
 
         Args:
             size: The largest batch.
             now: The time, s.
-            most_with_others: The size up to which the batch is filled with requests that wait
-                behind the requests of other robots.
 
         Returns:
             The batch, and the requests whose deadlines have passed or whose clients have left,
@@ -217,6 +267,7 @@ class FairQueue:
         lone = self._lone
         if (
             lone is not None
+            and (self.room is None or _is_served_first(lone))
             and not (lone.over or lone.origin.ended)
             and now <= lone.deadline
             # For most requests, which are taken immediately, the second check makes no call.
@@ -233,33 +284,57 @@ class FairQueue:
         expired: list[PendingRequest] = []
         still_waiting: list[_SessionQueue] = []  # sessions with further requests
 
-        robots, simulations = self._queues_by_priority
-        urgent = now + self._urgent_s()
-        while self._patient and self._patient.first_needed() <= urgent:
-            robots.add(self._patient.next())
-        if (
-            (robots.sources or self._patient)
-            and not self._yielded
-            and simulations.is_impatient(now)
-        ):
-            self._pick(simulations.next(), now, batch, expired, still_waiting)
-        # The batch has no slot for a simulation if all requests of that session are over or have
-        # expired.
-        self._yielded = bool(batch)
+        urgent, patient, displaced = self._urgent, self._patient, self._displaced
+        urgent_until = now + self._urgent_s()
+        while patient and patient.first_needed() <= urgent_until:
+            urgent.add(patient.next())
+        for robots in (displaced, self._without_slack):
+            while robots.is_impatient(now, BEHIND_OTHERS_S):
+                urgent.add(robots.next())
 
-        while robots.sources and len(batch) < size:
-            self._pick(robots.next(), now, batch, expired, still_waiting)
+        while urgent and len(batch) < size:
+            self._pick(urgent.next(), now, batch, expired, still_waiting)
         size = self._size_in_time(batch, size, now)
-        while self._patient and len(batch) < size:
-            if len(batch) >= most_with_others and self._patient.is_behind_others():
-                break
-            self._pick(self._patient.next(), now, batch, expired, still_waiting)
-        while simulations.sources and len(batch) < size:
-            self._pick(simulations.next(), now, batch, expired, still_waiting)
+        while patient and len(batch) < size:
+            self._pick(patient.next(), now, batch, expired, still_waiting)
+
+        if not (urgent or patient):
+            most = size if self.room is None else min(size, self.room.displaced)
+            while displaced and len(batch) < most:
+                self._pick(displaced.next(), now, batch, expired, still_waiting)
+        yielded = False
+        if not (urgent or patient or displaced):
+            most = self._most_with_others(batch, size, now)
+            simulations = self._simulations
+            is_turn = not self._yielded and simulations.is_impatient(now, PATIENCE_S)
+            if is_turn and len(batch) < most:
+                rows = len(batch)
+                self._pick(simulations.next(), now, batch, expired, still_waiting)
+                # The batch has no slot for a simulation if all requests of that session are over or
+                # have expired.
+                yielded = len(batch) > rows
+            for others in (self._without_slack, simulations):
+                while others and len(batch) < most:
+                    self._had_others = True
+                    self._pick(others.next(), now, batch, expired, still_waiting)
+        self._yielded = yielded
 
         for queue in still_waiting:
             self._enqueue(queue, now)
         return batch, expired
+
+    def _most_with_others(self, batch: Sequence[PendingRequest], size: int, now: float) -> int:
+        """Return how many requests the batch may have, at most `size`, with requests of robots
+        without slack and of simulations.
+        """
+        if self.room is None:
+            return size
+        most = min(size, self.room.beside if batch else self.room.alone)
+        is_held = bool(self._without_slack or self._simulations) and len(batch) >= most
+        if batch and is_held and len(batch) < size and now >= self._held_until:
+            self._held_until = now + self.room.held_s
+            return len(batch) + 1
+        return most
 
     def _size_in_time(self, batch: Sequence[PendingRequest], size: int, now: float) -> int:
         """Return how many requests the batch may have, at most `size`, so that further requests
@@ -283,8 +358,11 @@ class FairQueue:
             waiting.extend(queue)
 
         self._sessions.clear()
-        self._queues_by_priority = [_SourceQueue() for _ in Priority]
+        self._urgent = _SourceQueue()
         self._patient = _PatientQueue()
+        self._displaced = _SourceQueue()
+        self._without_slack = _SourceQueue()
+        self._simulations = _SourceQueue()
         self.depth = [0] * len(Priority)
         self.size = 0
         return waiting

@@ -8,6 +8,9 @@ observation. The needs of the robots are read from their requests.
 If the robots need more than the replica can compute, the robots whose episodes began first are
 served first, as many as can be in time. The requests of the other robots wait behind their
 requests. Otherwise, all robots would be slightly late.
+
+Robots that send no slack, and simulations, get what the robots with known needs leave: a batch with
+their requests is only so large that these robots are in time, who then send their requests earlier.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ import reprlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.interface import SLACK
@@ -28,8 +31,10 @@ from vlagents_ray.serve.queue.robots_load import (
     CostCurve,
     RobotNeed,
     RobotsLoad,
+    Room,
     answer_s,
     robots_load,
+    room_for_others,
 )
 
 _READ_S = 0.5  # time after which the needs of all sessions are read again, s
@@ -138,37 +143,55 @@ def stated_slack_s(info: Mapping[str, Any]) -> float | None:
     return min(float(slack_ms), _MOST_SLACK_MS) / 1e3
 
 
+class PacedQueue(Protocol):
+    """The queue of a replica, as its pace sees it: a `BatchQueue`."""
+
+    largest: int  # the largest batch
+    room: Room | None  # see `FairQueue.room`
+
+    def had_others(self) -> bool:
+        """Return whether requests waited behind the robots that are served first, since the last
+        call.
+        """
+
+    def curve(self) -> CostCurve | None:
+        """Return the measured durations of batches; None before the first batch."""
+
+    def depth_first(self) -> int:
+        """Return the number of waiting requests of robots that are served first."""
+
+
 class ReplicaPace:
-    """The load of a replica, and the pace of its robots. Its callers need no lock.
+    """The load of a replica, the pace of its robots, and the room that they leave to other clients
+    in the batches of the queue. Its callers need no lock.
 
     Args:
-        curve: Returns the measured durations of batches; None before the first batch.
+        queue: The replica's queue.
         plans: Returns the plan of each session, and whether a request of the session waits.
-        max_batch_size: The largest batch.
         clock: The engine's clock, s.
-        depth: Returns the number of requests that wait.
     """
 
     def __init__(
         self,
-        curve: Callable[[], CostCurve | None],
+        queue: PacedQueue,
         plans: Callable[[], Iterable[tuple[RobotPlan, bool]]],
-        max_batch_size: int,
         clock: Callable[[], float],
-        depth: Callable[[], int],
     ) -> None:
-        self._curve, self._plans = curve, plans
-        self._max_batch_size, self._clock = max_batch_size, clock
-        self._depth = depth
+        self._queue, self._plans, self._clock = queue, plans, clock
         self._load = IDLE  # load of the robots that are served first
-        # The size up to which batches are filled with requests of robots that wait behind others.
-        # In larger batches, the answers of the other robots would be late.
-        self.most_with_others: float = math.inf
-        self._robots = 0
+        self._robots = 0  # number of robots that send their slack
         self._others = 0  # number of robots that wait behind others
         self._throughput_hz = math.inf  # maximum number of answers per second
         self._read = -math.inf  # time at which the needs were read, s
         self._reread_s = _FIRST_READ_S  # time after which the needs are read again, s
+
+    def update(self) -> None:
+        """Read the needs of the robots again if there were robots, after a batch or an idle time.
+
+        Otherwise the last robot that leaves would keep its room.
+        """
+        if self._robots:
+            self.load()
 
     def load(self) -> RobotsLoad:
         """Return the load of the robots that are served first, which is at most half a second
@@ -195,10 +218,8 @@ class ReplicaPace:
         """
         load = self.load()
         need, now = plan.need, self._clock()
-        # A request that is sent before the waiting requests are answered would have to wait. The
-        # requests of robots that wait behind others are answered later.
-        waiting = self._depth() - (0 if plan.waits_behind_others else self._others)
-        waiting_s = max(0, waiting) / self._throughput_hz
+        # A request that is sent before the waiting requests are answered would have to wait.
+        waiting_s = self._queue.depth_first() / self._throughput_hz
         waited_s = now - plan.asked
         if need is None:
             # If many robots begin at the same time, they are answered one after the other. Their
@@ -237,11 +258,13 @@ class ReplicaPace:
         plans.sort(key=lambda plan: (plan.need is None, plan.began))
         known = Counter(plan.need for plan in plans if plan.need is not None)
         self._robots, self._others = len(plans), 0
-        self._load, self.most_with_others = IDLE, math.inf
-        curve = self._curve()
+        self._load, self._queue.room = IDLE, None
+        had_others = self._queue.had_others()
+        curve = self._queue.curve()
         if curve is None:
             return
-        self._throughput_hz = self._max_batch_size / curve.cost_s(self._max_batch_size)
+        largest = self._queue.largest
+        self._throughput_hz = largest / curve.cost_s(largest)
         if not known:
             return
 
@@ -252,10 +275,12 @@ class ReplicaPace:
         first = self._most_in_time(needs, curve)
         for index, plan in enumerate(plans):
             plan.waits_behind_others = index >= first and plan.need is not None
+        self._others = max(0, known.total() - first)
         self._load = self._load_of(needs[:first], curve)
-        if first < known.total():
-            self._others = known.total() - first
-            self.most_with_others = self._load.batch_size
+        possible = self._that_can_be_in_time(needs[:first], curve, 1.0)
+        room = self._queue.room = room_for_others(curve, possible, largest, self._load)
+        if had_others:
+            self._load = room.load
 
     def _most_in_time(self, needs: Sequence[RobotNeed], curve: CostCurve) -> int:
         """Return how many of the first robots can be in time together."""
@@ -268,9 +293,17 @@ class ReplicaPace:
         return loads - 1  # the first load is the load without robots
 
     def _load_of(self, needs: Sequence[RobotNeed], curve: CostCurve) -> RobotsLoad:
-        """Return the load of robots. A robot that cannot be in time even alone does not count,
+        """Return the load of robots."""
+        counts = self._that_can_be_in_time(needs, curve, USABLE)
+        return robots_load(curve, counts, self._queue.largest)
+
+    @staticmethod
+    def _that_can_be_in_time(
+        needs: Sequence[RobotNeed], curve: CostCurve, usable: float
+    ) -> Mapping[RobotNeed, int]:
+        """Return the number of robots with each need, if the share `usable` of the replica is
+        enough for each of them alone. A robot that cannot be in time even alone does not count,
         since it would make all other robots wait.
         """
         batch_s, soonest_s = curve.cost_s(1), answer_s(curve, 1, len(needs))
-        counts = Counter(need for need in needs if USABLE * need.interval_s(soonest_s) >= batch_s)
-        return robots_load(curve, counts, self._max_batch_size)
+        return Counter(need for need in needs if usable * need.interval_s(soonest_s) >= batch_s)

@@ -25,6 +25,16 @@ replica with a load of 1 grows without bound. In the simulation of six kinds of 
 start within 3 s, at least 98.1 % of a minute's ticks were in time at 0.9, and 91.6 % at 1.0.
 """
 
+# The largest load with which robots are in time if other requests fill all batches. Without them,
+# most batches are smaller than the load assumes.
+_USABLE_BESIDE = 0.75
+# Load up to which the next batch has room for each robot's request.
+_ROOMY = 0.5
+
+# Number of ticks of the slowest robot after which another row may be added to a batch of robots
+# although there is no room. Such a row makes a robot late by at most one tick of them.
+_HELD_TICKS = 100
+
 # Share of its longest interval after which a robot replans if the replica has room for that. The
 # margin is needed because arrivals are uneven, and requests are sent only at ticks.
 _RELAXED = 0.75
@@ -111,6 +121,15 @@ class RobotNeed:
         return max(left_s, 1 / self.hz) if left_s > 0 else 0.0
 
     @property
+    def slowest_answer_s(self) -> float:
+        """The longest time from a request to its answer with which the robot is in time, s.
+
+        A robot sends its next request at the first tick after an answer. Its rows must therefore
+        last for two answers and a tick.
+        """
+        return 1 / self.hz if self.rows == 1 else (self.rows - 1) / self.hz / 2
+
+    @property
     def longest_s(self) -> float:
         """The longest time from the capture of an observation until the next answer, s."""
         return self.rows / self.hz
@@ -182,6 +201,69 @@ def robots_load(
     paced_s = [(share * need.interval_s(latency_s), count) for need, count in needs.items()]
     usable_hz = USABLE * size / costs.cost_s(size)
     return RobotsLoad(load, size, latency_s, _common_interval_s(paced_s, usable_hz))
+
+
+class Room(NamedTuple):
+    """The room that the robots of a replica leave to other requests in its batches."""
+
+    displaced: int  # the most rows of a batch with displaced robots, see `FairQueue`
+    # The most rows of a batch with other requests, alone and together with requests of the robots.
+    alone: int
+    beside: int
+    # Interval between two single rows that are added to batches of robots if `beside` is 0, s.
+    held_s: float
+    load: RobotsLoad  # load of the robots while other requests use the room
+
+
+def room_for_others(
+    costs: CostCurve, needs: Mapping[RobotNeed, int], max_batch_size: int, load: RobotsLoad
+) -> Room:
+    """Compute the largest batches with other requests with which the robots are in time.
+
+    A batch of other requests may begin just before a robot's request arrives, and the other
+    requests fill the batches of robots. An answer thus takes the time of two such batches, or of
+    three if the next batch may have no room for a request. If even a single other request would
+    make robots late, other requests are only answered together with the only robot, whose next
+    request cannot arrive during that batch.
+
+    Args:
+        costs: The duration of the replica's batches.
+        needs: The number of robots with each need.
+        max_batch_size: The largest batch of the replica.
+        load: The load of the robots without other requests.
+    """
+    robots = sum(needs.values())
+    if not robots:
+        return Room(max_batch_size, max_batch_size, max_batch_size, 0.0, load)
+
+    sizes = np.arange(1, max_batch_size + 1)
+    costs_s = np.array([costs.cost_s(size) for size in sizes.tolist()])
+
+    held_s = _HELD_TICKS / min(need.hz for need in needs)
+
+    def loads(latencies_s: np.ndarray) -> np.ndarray:
+        shares: np.ndarray = _needed_hz(needs, latencies_s) * costs_s / sizes
+        return shares
+
+    def largest(latencies_s: np.ndarray) -> int:
+        slowest_s = min(need.slowest_answer_s for need in needs)
+        in_time = (loads(latencies_s) <= _USABLE_BESIDE) & (latencies_s <= slowest_s)
+        return max(sizes[in_time].tolist(), default=0)
+
+    has_room = (sizes >= robots) | (loads(2 * costs_s) <= _ROOMY)
+    latencies_s = np.where(has_room, 2, 3) * costs_s
+    alone = beside = largest(latencies_s)
+    if beside == 0 and robots == 1:
+        latencies_s = costs_s
+        beside = largest(latencies_s)
+    if beside == 0:
+        return Room(load.batch_size, 0, 0, held_s, load)
+
+    index = beside - 1
+    # The robots leave the time that they do not need to the other requests: their pace has no upper
+    # limit.
+    beside_others = RobotsLoad(float(loads(latencies_s)[index]), beside, float(latencies_s[index]))
+    return Room(load.batch_size, alone, beside, held_s, beside_others)
 
 
 def _needed_hz(needs: Mapping[RobotNeed, int], latencies_s: np.ndarray) -> np.ndarray:
