@@ -23,6 +23,7 @@ from vlagents_ray import (
     PlayerSettings,
 )
 from vlagents_ray.columns import Columns
+from vlagents_ray.contract import Rotation
 from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import SAFE
@@ -450,6 +451,46 @@ def test_limits_of_a_dataset_accept_its_demonstrations_and_no_ten_times_faster_o
     faster = episodes[0][::10] * (10 if delta else 1)
     with pytest.raises(InvalidAction):
         require_accepted(guard, faster)
+
+
+DOWN = {  # a hand that points down, where Euler angles and rotation vectors wrap
+    "euler_xyz": (3.1, 0.0, 0.0),
+    "axis_angle": (3.1, 0.0, 0.0),
+    "quat_xyzw": (1.0, 0.0, 0.0, 0.02),
+    "quat_wxyz": (0.02, 1.0, 0.0, 0.0),
+    "rot6d": (1.0, 0.0, 0.0, 0.0, -1.0, 0.04),
+}
+
+
+@pytest.mark.parametrize("delta", [False, True])
+@pytest.mark.parametrize("kind", DOWN)
+def test_limits_of_a_dataset_of_poses_are_those_of_the_angle_of_its_rotations(
+    tmp_path: Path, kind: Rotation, *, delta: bool
+) -> None:
+    spec = ActionSpec(dim=3 + len(DOWN[kind]), space="ee_pose", delta=delta, rotation=kind)
+    columns = Columns.from_spec(spec, spec.dim or 0)
+    speed = 0.5 / HZ  # rad per tick, about a diagonal axis
+    time_s = np.arange(600) / HZ
+    pose = np.array([0.0, 0.0, 0.0, *DOWN[kind]], np.float32)
+    rows = []
+    for part in np.sin(np.pi * time_s / 3) ** 2:
+        turn = part * speed * np.array([1.0, 1.0, 1.0]) / np.sqrt(3)
+        motion = np.zeros(columns.dim)
+        motion[3:6] = turn
+        pose = columns.moved(pose, motion.tolist())
+        row = pose.copy()
+        if kind == "euler_xyz" and not delta:
+            row[3:] = (row[3:] + np.pi) % (2 * np.pi) - np.pi
+        elif kind.startswith("quat") and not delta and len(rows) % 7 == 0:
+            row[3:] = -row[3:]  # the same rotation
+        rows.append(row)
+
+    folder = recorded(tmp_path / "demos", spec, [np.array(rows)])
+    limits = MotionLimits.read(folder)
+    assert isinstance(limits.velocity, tuple)
+    assert limits.velocity[3:6] == pytest.approx([2 * 0.5] * 3, rel=0.05)
+    guard = Guard(Contract(action=spec), limits=folder, hz=HZ)
+    require_accepted(guard, np.array(rows))
 
 
 def test_a_dataset_without_a_contract_has_actions_of_the_policys_kind(tmp_path: Path) -> None:

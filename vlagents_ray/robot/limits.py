@@ -4,6 +4,7 @@ URDF.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import xml.etree.ElementTree as ET
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vlagents_ray.columns import Columns
 from vlagents_ray.contract import ActionSpec
 from vlagents_ray.dataset_contract import INFO, DatasetContract
 from vlagents_ray.datasets.episode import TICK_COLUMN
@@ -213,19 +215,18 @@ class MotionLimits:
             raise ConfigError("expected at least one frame in data/, got none")
 
         actions = np.concatenate([section.actions for section in sections])
-        tolerance = _TOLERANCE * np.ptp(actions, axis=0)
-        deltas = (action or ActionSpec()).delta_columns(actions.shape[1])
-        paths = [_path(section, deltas) for section in sections]
+        columns = Columns.from_spec(action or ActionSpec(), actions.shape[1])
+        motions = [_motions(section, columns) for section in sections]
 
         def fastest(order: int) -> tuple[float, ...]:
-            """Return a limit of the paths' differences of order `order`, in units and seconds."""
-            changes = [np.abs(np.diff(path, order, axis=0)) for path in paths]
+            """Return a limit of the speed (order 1) or of its changes, in units and seconds."""
+            changes = [_sizes(np.diff(speeds, order - 1, axis=0), columns) for speeds in motions]
             frames = np.concatenate(changes)
             if not len(frames):
                 raise ConfigError(
                     f"expected {order + 1} frames at consecutive ticks, got at most "
-                    f"{max(map(len, paths))}; the recorder dropped the frames between (see the "
-                    "column `tick`): record again, at a lower rate or with smaller images"
+                    f"{1 + max(map(len, motions))}; the recorder dropped the frames between (see "
+                    "the column `tick`): record again, at a lower rate or with smaller images"
                 )
 
             limit: np.ndarray = np.quantile(frames, QUANTILE, axis=0)
@@ -233,7 +234,7 @@ class MotionLimits:
             # the quantile of all frames, so they have their own quantile.
             starts = []
             for section, section_changes in zip(sections, changes, strict=True):
-                if deltas and section.begins_episode:
+                if columns.relative and section.begins_episode:
                     starts.append(section_changes[:order].max(0))
             if starts:
                 start_limit = np.quantile(np.stack(starts), QUANTILE, axis=0, method="higher")
@@ -243,10 +244,14 @@ class MotionLimits:
             # move.
             return tuple(number if number > 0 else math.inf for number in limit.tolist())
 
+        tolerance = _TOLERANCE * np.ptp(actions, axis=0)
         low = actions.min(0) - tolerance
         high = actions.max(0) + tolerance
-        low[deltas] = -np.inf  # deltas are limited by `velocity`
-        high[deltas] = np.inf
+        unbounded = list(columns.relative)  # motions are limited by `velocity`
+        for rotation in columns.rotations:
+            unbounded += rotation.columns  # several numbers represent the same rotation
+        low[unbounded] = -np.inf
+        high[unbounded] = np.inf
         names = info["features"]["action"].get("names")
         return cls(
             low=tuple(low.tolist()),
@@ -422,25 +427,42 @@ class _Section(NamedTuple):
     begins_episode: bool  # whether the first action is the episode's first, which begins at rest
 
 
-def _path(section: _Section, deltas: list[int]) -> np.ndarray:
-    """Return the path of a section. The differences of the path are speeds, even if the actions
-    are deltas.
+def _motions(section: _Section, columns: Columns) -> np.ndarray:
+    """Return the motion of each tick of a section, in units per tick; see `Columns.motion`.
 
     Args:
         section: The section, with T actions of D numbers.
-        deltas: The indices of the relative numbers.
+        columns: The meaning of the numbers.
 
     Returns:
-        The actions, (T, D). If there are deltas, the result is the cumulative sum of the deltas;
-        at the beginning of an episode it begins at rest, (T + 3, D).
+        The motions of all actions but the first, (T - 1, D). At the beginning of an episode of
+        relative actions, those of three ticks at rest and of the first action are before them.
     """
-    path = section.actions.copy()
-    path[:, deltas] = np.cumsum(path[:, deltas], axis=0)
-    if not deltas or not section.begins_episode:
-        return path
-    before = path[:1].copy()
-    before[:, deltas] = 0.0
-    return np.concatenate([before, before, before, path])
+    rows = section.actions
+    if columns.relative and section.begins_episode:
+        rest = columns.still(rows[0]).astype(np.float64)
+        rows = np.concatenate([[rest] * 3, rows])
+    if columns.rotations:
+        motions = []
+        for last, row in itertools.pairwise(rows.tolist()):
+            motions.append(columns.motion(row, last))
+        return np.array(motions, np.float64).reshape(-1, columns.dim)
+
+    speeds = np.diff(rows, axis=0)
+    relative = list(columns.relative)
+    speeds[:, relative] = rows[1:, relative]
+    return speeds
+
+
+def _sizes(changes: np.ndarray, columns: Columns) -> np.ndarray:
+    """Return the sizes of motions or their changes, (T, D). The size of a rotation is an angle, in
+    each of its columns.
+    """
+    sizes: np.ndarray = np.abs(changes)
+    for rotation in columns.rotations:
+        part = slice(rotation.start, rotation.stop)
+        sizes[:, part] = np.linalg.norm(changes[:, part], axis=1, keepdims=True)
+    return sizes
 
 
 def _numbers(name: str, value: object) -> np.ndarray:

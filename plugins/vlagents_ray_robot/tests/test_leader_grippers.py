@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from vlagents_ray import ActionSpec, ConfigError, Contract, Obs
+from vlagents_ray.columns import Columns
+from vlagents_ray.contract import Rotation
 from vlagents_ray_robot.teleoperation import AxesDevice, AxesLeader
 
 OPEN, CLOSED = 1.0, -1.0
@@ -61,3 +65,67 @@ def test_arms_that_do_not_share_the_numbers_equally_are_an_error() -> None:
     )
     with pytest.raises(ConfigError, match="2 arms"):
         AxesLeader(Contract(action=unequal), Device(), step=0.1)
+
+
+HOLDING = 0.35  # the command of a gripper that holds something, neither open nor closed
+
+
+@pytest.mark.parametrize("reported", [None, 0.0, 0.5, 1.0])
+@pytest.mark.parametrize("way", ["values", "names", "columns", "arm"])
+@pytest.mark.parametrize("delta", [False, True])
+def test_a_takeover_keeps_the_last_command_of_a_gripper(
+    delta: bool, way: str, reported: float | None
+) -> None:
+    spec = ActionSpec(dim=4, space="joint", delta=delta)
+    arm = ActionSpec()
+    if way == "values":
+        spec = spec_of(delta, 1)
+    elif way == "names":
+        spec = replace(spec, names=("a", "b", "c", "gripper"))
+    elif way == "columns":
+        spec = replace(spec, grippers=(3,))
+    else:
+        arm = replace(arm, names=("a", "b", "c", "gripper.pos"))
+
+    device = Device()
+    leader = AxesLeader(Contract(action=spec), device, step=0.1)
+    leader.join(arm)
+    obs = Obs(state={"joints": np.array([0.1, 0.2, 0.3, 0.9], np.float32)}, gripper=reported)
+    last = np.array([0.0, 0.0, 0.0, HOLDING], np.float32)
+    leader.engaged()
+    leader.begin(last)
+    taken_over = [float(leader.action(obs)[3]) for _ in range(3)]
+    leader.rebase(None)  # the robot was stopped
+    stopped = [float(leader.action(obs)[3]) for _ in range(3)]
+    leader.rebase(leader.action(obs))  # the guard rejected an action
+    rejected = [float(leader.action(obs)[3]) for _ in range(3)]
+    assert {*taken_over, *stopped, *rejected} == {float(last[3])}
+    if way == "values":
+        device.press()
+        assert leader.action(obs)[3] == CLOSED
+
+
+@pytest.mark.parametrize("reported", [None, 0.0, 0.5, 0.89])
+def test_a_gripper_without_a_command_is_open_only_if_it_is_measured_as_open(
+    reported: float | None,
+) -> None:
+    leader = AxesLeader(Contract(action=spec_of(True, 1)), Device(), step=0.1)
+    leader.engaged()
+    leader.begin(None)
+    assert leader.action(Obs(gripper=reported))[3] == CLOSED
+    leader.begin(None)
+    assert leader.action(Obs(gripper=1.0))[3] == OPEN
+
+
+@pytest.mark.parametrize("kind", ["quat_xyzw", "quat_wxyz", "rot6d", "axis_angle", "euler_xyz"])
+def test_a_device_at_rest_commands_no_rotation(kind: Rotation) -> None:
+    width = {"quat_xyzw": 4, "quat_wxyz": 4, "rot6d": 6}.get(kind, 3)
+    spec = ActionSpec(dim=3 + width, space="ee_pose", delta=True, rotation=kind)
+    device = Device()
+    leader = AxesLeader(Contract(action=spec), device, step=0.1)
+    leader.engaged()
+    columns = Columns.from_spec(spec, spec.dim or 0)
+    np.testing.assert_array_equal(leader.action(Obs()), columns.still())
+    device.moves[3] = 1.0  # roll
+    turned = columns.motion(leader.action(Obs()).tolist(), columns.still().tolist())
+    assert turned[:6] == pytest.approx([0, 0, 0, 0.1, 0, 0], abs=1e-6)
