@@ -158,10 +158,6 @@ class Intake:
 
         if is_act:
             session = self._sessions.get(session_id)
-            if session.agent is None:
-                raise NotReset(
-                    f"session {session_id!r}: act before a successful reset; reset first"
-                )
             # Only acts for a policy in a child process refer to a stored observation.
             is_stored = bool(request.prepared)
             preparation = _take_stored(session, pending) if is_stored else None
