@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+from typing import Any
+
 import numpy as np
 import pytest
 
 from vlagents_ray import ActionSpec, ConfigError, Contract, Obs
 from vlagents_ray.errors import InvalidAction
-from vlagents_ray.robot import Guard
+from vlagents_ray.robot import Guard, MotionLimits
 
 
 def row(*values: float) -> np.ndarray:
@@ -86,3 +89,36 @@ def test_a_measured_pose_that_is_none_is_refused() -> None:
 def test_a_largest_step_that_would_bound_nothing_is_refused(max_step: float | np.ndarray) -> None:
     with pytest.raises(ConfigError, match="max_step"):
         Guard(max_step=max_step)
+
+
+SHAPES = (None, 1.0, (1.0,), (1.0, 2.0), (1.0, 2.0, 3.0), ((1.0, 2.0, 3.0),))
+
+
+@pytest.mark.parametrize("dim", [None, 3])
+@pytest.mark.parametrize("name", ["low", "high", "max_step", "velocity", "first"])
+def test_bounds_of_another_size_than_an_action_are_an_error_of_the_settings(
+    name: str, dim: int | None
+) -> None:
+    """All pairs of sources: the guard's own bounds, and those of the limits."""
+    for own, of_limits in itertools.product(SHAPES, SHAPES):
+        bounds: dict[str, Any] = {}
+        limits: dict[str, Any] = {}
+        if own is not None and name in ("low", "high", "max_step"):
+            bounds[name] = np.array(own)
+        if of_limits is not None:
+            limits["acceleration" if name == "max_step" else name] = of_limits
+
+        sizes = [np.shape(value) for value in (*bounds.values(), *limits.values())]
+        fits = all(size in ((), (3,)) for size in sizes)
+        assert is_accepted(dim, bounds, limits) == fits, (own, of_limits)
+
+
+def is_accepted(dim: int | None, bounds: dict[str, Any], limits: dict[str, Any]) -> bool:
+    """Return whether a guard with these bounds and limits accepts actions of three numbers."""
+    contract = Contract(action=ActionSpec(dim=dim, delta=False))
+    try:
+        guard = Guard(contract, limits=MotionLimits(**limits), hz=50, **bounds)
+        guard(row(1, 2, 3) if "low" in {*bounds, *limits} else row(1, 1, 1))
+    except ConfigError:
+        return False
+    return True

@@ -90,7 +90,7 @@ class AbsoluteActions(Wrapper):
             inner,
             state=state | dict(inner.state or {}),
             gripper=needs_gripper(state_names) or inner.gripper,
-            action=replace(inner.action, delta=False),
+            action=replace(inner.action, delta=False, absolute=None),
         )
 
     def initialize(self) -> None:
@@ -112,6 +112,11 @@ class AbsoluteActions(Wrapper):
             faults.append(f"actions in the space {action.space!r}")
         if action.rotation not in (None, "none"):
             faults.append(f"rotations as {action.rotation!r}")
+        dim = action.dim or 0
+        targets = {column % dim for column in self.config.absolute if dim}
+        added = sorted({*(action.absolute or ())} - targets)
+        if added:
+            faults.append(f"the absolute columns {added}, which `absolute` does not name")
         if faults:
             raise ConfigError(
                 "absolute_actions: expected relative actions that add up with the policy's "

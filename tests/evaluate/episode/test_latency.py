@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from in_process_episode import run_episode
 from pydantic import ValidationError
 
+from vlagents_ray.chunking.buffer import ChunkBuffer
 from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
@@ -91,6 +92,45 @@ def test_holding_repeats_the_last_action_and_zero_keeps_only_the_gripper() -> No
     stopped = next(still.ticks(CHUNK, 0.1))
     assert (held.action.tolist(), held.waited, held.starved) == ([4, -1], True, True)
     assert stopped.action.tolist() == [0, -1]
+
+
+@pytest.mark.parametrize("settings", [{}, {"meanwhile": "hold"}, {"meanwhile": "zero"}], ids=str)
+@pytest.mark.parametrize("env", [RELATIVE, ABSOLUTE], ids=["relative", "absolute"])
+def test_a_further_task_begins_with_the_last_targets_and_without_motion(
+    env: Contract, settings: dict[str, Any]
+) -> None:
+    last = np.array([0.5, -1.0], np.float32)
+    still = [0.0, -1.0] if env is RELATIVE else [0.5, -1.0]
+    player = ChunkExecutor(4, clock(**settings), env, last)
+    waiting = [tick.action.tolist() for tick in player.ticks(CHUNK, 0.3) if tick.waited]
+    assert waiting == [still] * 3
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(1, 6), st.integers(0, 9), st.integers(0, 9), st.booleans()),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_an_answer_ends_the_episode_only_with_its_last_row(
+    answers: list[tuple[int, int, int, bool]],
+) -> None:
+    """An answer that is too late for real-time chunking is dropped, as a chunk player drops it."""
+    player = ChunkExecutor(2, clock(), RELATIVE)
+    plan = ChunkBuffer()
+    for count, late, continued, done in answers:
+        rows = CHUNK[:count] + 0.5
+        executed = player._plan.executed
+        ticks = list(player.ticks(rows, late / 10, {GIVEN: continued}, done=done))
+        plan.executed = player._plan.executed
+        is_dropped = plan.outruns(executed, {GIVEN: continued}) and len(ticks) == late
+        is_last_row = bool(ticks) and ticks[-1].action.tolist() == rows[-1].tolist()
+        assert any(tick.done for tick in ticks) == (done and not is_dropped)
+        if done and not is_dropped:
+            assert is_last_row
+            assert not any(tick.done for tick in ticks[:-1])
+            return
 
 
 def test_a_single_action_is_executed_however_late_it_comes() -> None:
