@@ -68,9 +68,8 @@ def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merge
     )
     assert done.returncode == 0, done.stdout + done.stderr
     merged = Results.load(tmp_path / "all")
-    assert [sorted(one.result.key.seed for one in case.episodes) for case in merged.cases] == [
-        list(range(12))
-    ]
-    assert [one.result.status for one in merged.cases[0].episodes] == ["done"] * 12
+    [case] = merged.cases
+    assert sorted(one.result.key.seed for one in case.episodes) == list(range(12))
+    assert [one.result.status for one in case.episodes] == ["done"] * 12
     first, second = sorted(merged.runs, key=lambda run: run.started)
     assert second.started < (first.ended or 0), "both drivers must run at the same time"

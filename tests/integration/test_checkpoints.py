@@ -225,12 +225,11 @@ SWEEP = {"envs": ["eval_fakes:Line"], "episodes": 3, "video": "none", "steps": [
 
 def outcomes(results: Results) -> dict[str, list[tuple[str | None, str | None]]]:
     """Return the checkpoint and the digest of the actions of each episode, by policy and step."""
-    return {
-        case.policy_id: [
-            (episode.result.checkpoint, episode.result.actions_sha256) for episode in case.episodes
-        ]
-        for case in results.cases
-    }
+    outcomes: dict[str, list[tuple[str | None, str | None]]] = {}
+    for case in results.cases:
+        episodes = [episode.result for episode in case.episodes]
+        outcomes[case.policy_id] = [(one.checkpoint, one.actions_sha256) for one in episodes]
+    return outcomes
 
 
 def test_a_sweep_evaluates_each_checkpoint_on_one_server(

@@ -13,7 +13,7 @@ import numpy as np
 
 from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
+from vlagents_ray.policies.base import AdapterConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.weights.safetensors import header_of, parts_of
 
@@ -24,7 +24,7 @@ LAYERS = ("see", "look", "head.0", "head.2")
 class Small(ModelPolicy):
     """A network that processes a state, as numbers and as an image, and adds noise."""
 
-    Config = ModelConfig
+    Config = AdapterConfig
     trainable = network = "model"
 
     @property

@@ -155,11 +155,11 @@ def resolved_extras(only: Sequence[str]) -> dict[str, dict[str, Any]]:
     empty.
     """
     with ThreadPoolExecutor(8) as pool:
-        futures = {
-            extra or "none": [pool.submit(packages, extra, python) for python in PYTHONS]
-            for extra in extras()
-            if not only or (extra or "none") in only
-        }
+        futures = {}
+        for extra in extras():
+            name = extra or "none"
+            if not only or name in only:
+                futures[name] = [pool.submit(packages, extra, python) for python in PYTHONS]
     found = {}
     for extra in extras():
         name = extra or "none"

@@ -20,7 +20,7 @@ from pydantic import Field
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import ModelPolicy, Prediction, Row, shared_frames
+from vlagents_ray.policies.base import AdapterConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.adapter import LoraAdapter
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
@@ -57,7 +57,7 @@ _STATISTICS = ("state_mean", "state_std", "actions_mean", "actions_std")
 InputStyle = Literal["transformers", "openpi"]
 
 
-class Pi0Config(AttentionConfig):
+class Pi0Config(AttentionConfig, AdapterConfig):
     """Settings of π0, in addition to the settings of all models."""
 
     cameras: dict[str, str] | None = Field(

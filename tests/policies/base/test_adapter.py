@@ -19,6 +19,7 @@ from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
 from vlagents_ray.policies.agent_copies import AgentCopies
+from vlagents_ray.policies.base import ModelConfig
 from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray.policies.base.adapter import LoraAdapter
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
@@ -31,6 +32,11 @@ from vlagents_ray.weights.trainable import portable
 pytestmark = pytest.mark.torch
 
 RTOL = 1e-5
+
+
+class WithoutAdapters(Small):
+    Config = ModelConfig
+    network = None
 
 
 class WithoutNetwork(Small):
@@ -178,11 +184,15 @@ def test_a_learner_pushes_all_weights_or_the_layers_that_its_adapter_changes(
     )
 
 
-def test_a_family_without_a_network_of_torch_says_so() -> None:
-    with pytest.raises(
-        ConfigError, match="adapter: WithoutNetwork does not accept one; merge it into its base"
-    ):
-        WithoutNetwork.from_config({"checkpoint": "any", "adapter": "any"})
+def test_an_adapter_is_an_unknown_key_in_the_settings_of_other_families() -> None:
+    with pytest.raises(ConfigError, match="adapter: there is no such setting"):
+        WithoutAdapters.from_config({"checkpoint": "any", "adapter": "any"})
+
+
+def test_a_policy_that_accepts_adapters_must_name_its_network() -> None:
+    policy = WithoutNetwork.from_config({"checkpoint": "any", "adapter": "any"})
+    with pytest.raises(ConfigError, match=r"WithoutNetwork.network: expected the name"):
+        policy.initialize()
 
 
 @pytest.mark.parametrize(

@@ -368,7 +368,11 @@ def test_the_memory_of_the_childs_gpu_is_the_replicas(
         both.close()
 
 
-def test_what_the_child_does_on_its_gpu_is_in_the_metrics_of_the_replica() -> None:
+def test_what_the_child_does_on_its_gpu_is_in_the_metrics_of_the_replica(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # An earlier engine of this process has replayed graphs.
+    monkeypatch.setattr(CudaGraph, "replays", 7)
     engine = Engine(agent("OnGpu"))
     engine.start()
     try:
@@ -381,7 +385,7 @@ def test_what_the_child_does_on_its_gpu_is_in_the_metrics_of_the_replica() -> No
         assert collected.gpu_ms.values == [3.5, 4.5]
         assert (collected.out_of_memory, collected.replays) == (1, 4)
         assert engine.stats.gpu_ms == 4.5, "the live page must show the latest value"
-        assert engine.stats.replays == CudaGraph.replays + 4
+        assert engine.stats.replays == 4
 
         nothing_new = engine.collect_stats()
         assert nothing_new.gpu_ms.values == []

@@ -2,8 +2,8 @@
 chunks.
 """
 
-from vlagents_ray.policies.base.config import ModelConfig
+from vlagents_ray.policies.base.config import AdapterConfig, ModelConfig
 from vlagents_ray.policies.base.model_inputs import Row, shared_frames
 from vlagents_ray.policies.base.policy import ModelPolicy, Prediction
 
-__all__ = ["ModelConfig", "ModelPolicy", "Prediction", "Row", "shared_frames"]
+__all__ = ["AdapterConfig", "ModelConfig", "ModelPolicy", "Prediction", "Row", "shared_frames"]

@@ -47,12 +47,6 @@ class ModelConfig(BaseModel, extra="forbid"):
     checkpoint_step: int | None = Field(
         default=None, ge=0, description="Training step that replaces `{step}`."
     )
-    adapter: str | None = Field(
-        default=None,
-        min_length=1,
-        description="LoRA adapter of the checkpoint that is merged into its weights: a folder of "
-        "PEFT, or a hub id (org/name, org/name@COMMIT). null: none.",
-    )
     device: str = Field(
         default="auto",
         description="Device: `cpu`, `cuda`, `cuda:1`, or `auto`, an accelerator if there is one.",
@@ -186,3 +180,16 @@ class ModelConfig(BaseModel, extra="forbid"):
     def rows(self) -> int:
         """The largest number of rows in one forward pass."""
         return self.batch_sizes[-1] if self.batch_sizes else self.max_rows
+
+
+class AdapterConfig(ModelConfig):
+    """Settings of a family that accepts a LoRA adapter, in addition to the settings of all models.
+    Its policy sets `ModelPolicy.network`.
+    """
+
+    adapter: str | None = Field(
+        default=None,
+        min_length=1,
+        description="LoRA adapter of the checkpoint that is merged into its weights: a folder of "
+        "PEFT, or a hub id (org/name, org/name@COMMIT). null: none.",
+    )

@@ -49,7 +49,7 @@ from vlagents_ray.policies.base.accelerator import (
 from vlagents_ray.policies.base.adapter import LoraAdapter
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
-from vlagents_ray.policies.base.config import ModelConfig
+from vlagents_ray.policies.base.config import AdapterConfig, ModelConfig
 from vlagents_ray.policies.base.model_inputs import (
     Row,
     count_in,
@@ -129,10 +129,6 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         # Replaced with the server's report when the model is loaded.
         self.report = LoadingReport(lambda _: None, COMPILED_SIZES)
         self.episode: PolicyEpisode | None = None
-        if self.config.adapter is not None and self.network is None:
-            raise ConfigError(
-                f"adapter: {type(self).__name__} does not accept one; merge it into its base"
-            )
 
     def loaded(self) -> Any:
         """Return `self.model`; raises `PolicyFailed` before `initialize`."""
@@ -238,10 +234,10 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         lack of memory is an error before a robot moves.
         """
         with current_report() as self.report:
-            if self.config.adapter is None:
+            if self._adapter_source is None:
                 self.model = self.load()
             else:
-                self._load_with_adapter(self.config.adapter)
+                self._load_with_adapter(self._adapter_source)
         for device in self.report.devices:
             set_matmul(self.config.matmul, device)
         self._decide_on_compiling()
@@ -407,15 +403,26 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             )
         return super()._trainable()
 
+    @property
+    def _adapter_source(self) -> str | None:
+        """The adapter that the settings name; None if the family accepts none."""
+        config = self.config
+        return config.adapter if isinstance(config, AdapterConfig) else None
+
     def _load_with_adapter(self, source: str) -> None:
         """Load the checkpoint, and merge the adapter at `source` into its weights."""
+        if self.network is None:
+            raise ConfigError(
+                f"{type(self).__name__}.network: expected the name of the torch module into which "
+                "an adapter is merged, got None; set it, or use ModelConfig as Config"
+            )
         with used_checkpoints():  # the adapter is not one of the files of the base
             self.adapter = LoraAdapter.find(source)
         with used_checkpoints() as base:
             self.model = self.load()
 
         self.adapter.require_base(self.config.checkpoint, base)
-        self.adapter.merge_into(attrgetter(self.network or "")(self))
+        self.adapter.merge_into(attrgetter(self.network)(self))
         self.weights_id = weights_of([*base, self.adapter.folder]) if base else None
 
     def _begin(self, instruction: str, seed: int) -> None:

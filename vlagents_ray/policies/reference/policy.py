@@ -13,7 +13,7 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import (
-    ModelConfig,
+    AdapterConfig,
     ModelPolicy,
     Prediction,
     Row,
@@ -51,7 +51,7 @@ class ReferencePasses(FlowPasses):
         return self.model.velocity(encoded, actions.to(encoded.dtype), times).float()
 
 
-class ReferenceConfig(ModelConfig):
+class ReferenceConfig(AdapterConfig):
     """Settings of the reference policy, in addition to those of all models."""
 
     embodiment: str | None = Field(

@@ -82,7 +82,9 @@ class MetricsBuffer:
     def __init__(self) -> None:
         self.gpu_ms: float | None = None  # time of the last forward pass on a GPU
         self._replayed_elsewhere = 0  # number of replays of CUDA graphs in other processes
-        self._collected_replays = 0  # number of collected replays of this process
+        # Number of replays of this process before, and of those that were collected; other engines
+        # of the process may have been there before.
+        self._replayed_before = self._collected_replays = CudaGraph.replays
         self._enabled = False
         self._lock = threading.Lock()
         self._collected = Collected()
@@ -170,7 +172,7 @@ class MetricsBuffer:
     @property
     def replays(self) -> int:
         """The number of replays of CUDA graphs in all processes of the replica."""
-        return CudaGraph.replays + self._replayed_elsewhere
+        return CudaGraph.replays - self._replayed_before + self._replayed_elsewhere
 
     def add_gpu_work(self, work: GpuWork) -> None:
         """Record the GPU work of another process of the replica."""

@@ -7,11 +7,11 @@ from typing import Any
 
 from pydantic import Field
 
-from vlagents_ray.policies.base.config import NoiseLevel
+from vlagents_ray.policies.base.config import AdapterConfig, NoiseLevel
 from vlagents_ray_models.attention_config import AttentionConfig
 
 
-class LeRobotConfig(AttentionConfig):
+class LeRobotConfig(AttentionConfig, AdapterConfig):
     """Settings of a policy from a checkpoint of LeRobot.
 
     The checkpoint is a folder or a hub id with `config.json`, `model.safetensors` and LeRobot's two

@@ -72,16 +72,6 @@ class OpenVLAOFTConfig(prismatic.PrismaticConfig):
     )
 
     @model_validator(mode="after")
-    def _no_adapter(self) -> Self:
-        if self.adapter is not None:
-            raise ValueError(
-                f"adapter: expected none, since an adapter of OpenVLA-OFT was trained together "
-                f"with its action head, got {self.adapter!r}; merge it into its base, and serve "
-                "that with the head"
-            )
-        return self
-
-    @model_validator(mode="after")
     def _steps_fit(self) -> Self:
         if self.inference_steps > self.diffusion_steps:
             raise ValueError(

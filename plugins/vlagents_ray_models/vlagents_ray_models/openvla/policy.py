@@ -18,7 +18,7 @@ from pydantic import Field
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import Prediction, Row
+from vlagents_ray.policies.base import AdapterConfig, Prediction, Row
 from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras
 from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation, held
@@ -30,7 +30,7 @@ _IMAGE = "image"  # name of the model's only camera
 _CACHE = 3  # index of the argument `cache` of `TokenDecoder.continue_from`
 
 
-class OpenVLAConfig(prismatic.PrismaticConfig):
+class OpenVLAConfig(prismatic.PrismaticConfig, AdapterConfig):
     """Settings of OpenVLA."""
 
     center_crop: bool = Field(
