@@ -394,6 +394,12 @@ def test_a_contract_without_a_meaning_is_an_error(spec: ActionSpec, dim: int, ma
         Columns.from_spec(spec, dim)
 
 
+def test_grippers_of_an_arm_with_more_numbers_are_an_error() -> None:
+    arm = ActionSpec(grippers=(7,))
+    with pytest.raises(ConfigError, match="from 0 to 2"):
+        Columns.from_spec(ActionSpec(delta=False), 3, arm)
+
+
 def test_the_columns_are_part_of_the_contract() -> None:
     contract = Contract(
         action=ActionSpec(delta=True, absolute=(6,), rotation="rot6d", rotation_columns=(0,))

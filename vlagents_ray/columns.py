@@ -378,12 +378,6 @@ def _require_consistent(spec: ActionSpec, dim: int) -> None:
             f"action.rotation: expected 'axis_angle' or 'euler_xyz' for velocities, got "
             f"{spec.rotation!r}, which has no rate; declare the rotation of the velocities"
         )
-    outside = [column for column in spec.grippers or () if not 0 <= column < dim]
-    if outside:
-        raise ConfigError(
-            f"action.grippers: expected columns from 0 to {dim - 1}, got {outside}; correct "
-            "`grippers` or `dim` of the contract"
-        )
     opened, closed = spec.gripper_open, spec.gripper_closed
     if opened is not None and opened == closed:
         raise ConfigError(
@@ -400,6 +394,12 @@ def _grippers(spec: ActionSpec, dim: int) -> Iterator[int]:
     closed gripper.
     """
     if spec.grippers is not None:
+        outside = [column for column in spec.grippers if not 0 <= column < dim]
+        if outside:
+            raise ConfigError(
+                f"action.grippers: expected columns from 0 to {dim - 1}, got {outside}; correct "
+                "`grippers` or `dim` of the contract of the policy or the arm"
+            )
         yield from spec.grippers
         return
     named = list(_named(spec, dim, _is_gripper))

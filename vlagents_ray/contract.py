@@ -81,52 +81,10 @@ class ActionSpec:
 
     @property
     def relative(self) -> bool | None:
-        """Whether zeros command no motion (deltas, velocities) instead of a target pose; None if
-        the contract does not specify it.
+        """Whether the actions are motions (deltas, velocities) except for their targets and
+        grippers; None if the contract does not specify it. `Columns` tells which numbers these are.
         """
         return True if self.delta or "velocity" in (self.space or "") else self.delta
-
-    def gripper_columns(self, dim: int) -> list[int]:
-        """Return the columns of the grippers in an action: the last column of each arm's part.
-
-        A gripper's value is a position, even in relative actions.
-
-        Args:
-            dim: The number of values in an action.
-
-        Returns:
-            The columns in rising order; empty if neither `gripper_open` nor `gripper_closed` is
-            set.
-
-        Raises:
-            ConfigError: `arms` does not divide `dim`.
-        """
-        if self.gripper_open is None and self.gripper_closed is None:
-            return []
-        arms = len(self.arms or ("",))
-        if dim % arms:
-            raise ConfigError(
-                f"action.arms: expected a number of values that {arms} arms {self.arms} share "
-                f"equally, got {dim}; correct `arms` or `dim` of the contract"
-            )
-        width = dim // arms
-        return [(arm + 1) * width - 1 for arm in range(arms)]
-
-    def delta_columns(self, dim: int) -> list[int]:
-        """Return the columns of an action that are deltas or velocities; raises the errors of
-        `gripper_columns`.
-
-        Args:
-            dim: The number of values in an action.
-
-        Returns:
-            The columns in rising order: all columns except the grippers' if actions are relative,
-            else none.
-        """
-        if not self.relative:
-            return []
-        grippers = self.gripper_columns(dim)
-        return [column for column in range(dim) if column not in grippers]
 
 
 @explain_unknown_fields()
