@@ -93,6 +93,9 @@ _HANDSHAKE_S = 5.0  # maximum time until the first bytes of a client
 _STRANGERS = 64  # maximum number of connections without a session; one more ends the oldest
 # Bytes of Zenoh's protocol around a message, which has its key, and around each KiB of a message.
 _OVERHEAD_BYTES, _OVERHEAD_SHARE = 1024, 1024
+# Number of messages whose fragments Zenoh joins at the same time: a reliable message and another one
+# of each of eight priorities.
+_JOINED = 16
 _NO_ROOM_S = 10.0  # time after which a connection ends if there is no memory for its bytes
 _END_S = 3.0  # the time limit for the end of a robot's thread
 # LeRobot's names for the modes in which a robot executes chunks: one chunk after another, or
@@ -288,8 +291,7 @@ class RobotConnection(ForwardedConnection):
         is_robot = dialect.config.priority == "robot"
         self._counting = threading.Lock()  # guards the two following values
         self._incomplete = 0  # bytes that arrived and belong to no message that Zenoh has delivered
-        # Zenoh joins the fragments of one reliable message and of one other message at a time.
-        self._most_incomplete = 2 * _most_bytes(dialect.context)
+        self._most_incomplete = _JOINED * _most_bytes(dialect.context)
         self._arriving = ArrivingBytes(dialect.context.admission, self._share, is_robot, self.end)
 
     @property
@@ -493,9 +495,6 @@ class RobotNetwork:
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
             "transport/shared_memory/enabled": False,
-            # Zenoh joins the fragments of a message before it delivers the message. Messages of
-            # other priorities would be joined at the same time.
-            "transport/unicast/qos/enabled": False,
             "transport/link/rx/max_message_size": _most_bytes(self.dialect.context),
         }
         for setting, value in all_settings.items():
