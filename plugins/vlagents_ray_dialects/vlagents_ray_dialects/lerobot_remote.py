@@ -93,8 +93,8 @@ _HANDSHAKE_S = 5.0  # maximum time until the first bytes of a client
 _STRANGERS = 64  # maximum number of connections without a session; one more ends the oldest
 # Bytes of Zenoh's protocol around a message, which has its key, and around each KiB of a message.
 _OVERHEAD_BYTES, _OVERHEAD_SHARE = 1024, 1024
-# Number of messages whose fragments Zenoh joins at the same time: a reliable message and another one
-# of each of eight priorities.
+# Number of messages whose fragments Zenoh joins at the same time: a reliable one and another one of
+# each of eight priorities.
 _JOINED = 16
 _NO_ROOM_S = 10.0  # time after which a connection ends if there is no memory for its bytes
 _END_S = 3.0  # the time limit for the end of a robot's thread
