@@ -69,7 +69,6 @@ class StartPairs(NamedTuple):
         return StartPairs(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-NO_PAIRS = StartPairs(Pairs(), Pairs(), Pairs())
 Strata = dict[str, dict[str, StartPairs]]  # keys: env, start
 
 
@@ -92,16 +91,19 @@ class PairedOutcomes:
             for env, starts in stratum.items():
                 joined = envs.setdefault(env, {})
                 for start, pairs in starts.items():
-                    joined[start] = joined.get(start, NO_PAIRS) + pairs
+                    joined[start] = joined[start] + pairs if start in joined else pairs
 
+        numbers = [Counter(starts.values()) for starts in envs.values()]
         completions = []
-        for place in range(len(NO_PAIRS)):
-            counts = [
-                Counter(pairs[place] for pairs in starts.values()) for starts in envs.values()
-            ]
-            for count in counts:
-                del count[Pairs()]
-            completions.append(tuple(counts))
+        for place in range(len(StartPairs._fields)):
+            strata_of_place: list[Counter[Pairs]] = []
+            for starts_by_pairs in numbers:
+                counts: Counter[Pairs] = Counter()
+                for pairs, number in starts_by_pairs.items():
+                    counts[pairs[place]] += number
+                del counts[Pairs()]
+                strata_of_place.append(counts)
+            completions.append(tuple(strata_of_place))
         finished, worst, best = completions
         return cls(finished, worst, best, is_sequential)
 
@@ -346,7 +348,7 @@ def clock_gaps(results: Results) -> list[Comparison]:
         if counterpart is None:
             continue
         pairs = _pairs(case, counterpart, results.starts)
-        if _finished(pairs).total:
+        if _are_shared(pairs):
             names = (
                 f"{case.policy_id}, {case.suite} in real time",
                 f"{case.policy_id}, {counterpart.suite}".rstrip(", "),
@@ -424,7 +426,7 @@ def _shared(results: Results, a: str, b: str, *, accept_changes: bool) -> _Share
             _changes_between(results, case, other, accept_changes=accept_changes)
         )
         pairs = _pairs(case, other, results.starts)
-        if _finished(pairs).total:
+        if _are_shared(pairs):
             suites.setdefault(case.suite, {})[case.env] = pairs
             compared.append((case, other))
 
@@ -535,7 +537,8 @@ def _pairs(
     for key in a.outcomes:
         if key in keys:
             pair = _PAIRS[a.outcomes[key], b.outcomes[key]]
-            pairs[names[key]] = pairs.get(names[key], NO_PAIRS) + pair
+            name = names[key]
+            pairs[name] = pairs[name] + pair if name in pairs else pair
     return pairs
 
 
@@ -557,6 +560,11 @@ _PAIRS = {
     )
     for a, b in itertools.product((True, False, None), repeat=2)
 }
+
+
+def _are_shared(starts: Mapping[str, StartPairs]) -> bool:
+    """Return whether both policies finished an episode of these starts."""
+    return any(pairs.finished.total for pairs in starts.values())
 
 
 def _finished(starts: Mapping[str, StartPairs]) -> Pairs:
