@@ -81,8 +81,10 @@ class Robot(Protocol):
 
     `vlagents-ray robot` and the check of a robot use further attributes of a robot that has them:
 
-    - `contract`: its observations and actions.
-    - `joint_names`: its joints in the order of an action, without grippers.
+    - `contract`: its observations and actions, with the columns of its grippers, which the policy's
+      contract may not declare.
+    - `joint_names`: its joints in the order of an action, with or without grippers. If each number
+      of an action has a name, "gripper" in a name declares a gripper.
     - `joint_limits`: the range of each joint, (D, 2) in the joints' units.
     - `dates_pictures`: whether `captured_at` is derived from the time stamps of the sensors, which
       reveal a camera that hangs.

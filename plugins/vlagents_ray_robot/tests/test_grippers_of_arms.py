@@ -355,3 +355,31 @@ def test_only_policy_and_operator_change_the_goal_of_a_gripper(
             applied = drive(case, robot, way, kind, seed + 2 * run)
             assert applied > 0
     assert set(robot.seen) == {(case.grasp,) * len(case.grippers)}
+
+
+class SingleActions(Agent):
+    """A policy without a plan, which commands one closed gripper at each tick."""
+
+    contract = Contract(action=BARE)
+
+    def act(self, obs: Obs) -> Act:
+        action = obs.state["joints"] + np.float32(JOINT_STEP)
+        action[2] = 0.0
+        return Act(action)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_without_a_chunk_player_the_guard_also_knows_the_grippers_of_the_arm(way: str) -> None:
+    measure = measured_state("joints")
+    guard = Guard(SingleActions.contract, measure=measure, max_step=0.1)
+    with own(WAYS[way]) as robot:
+        ticks = itertools.count()
+
+        def until() -> bool:
+            tick = next(ticks)
+            robot.holds = "a camera hangs" if 5 <= tick < 8 else None
+            return tick > 20
+
+        run_loop(robot, SingleActions(), hz=HZ, until=until, options=LoopOptions(guard=guard))
+    assert robot.applied > 10
+    assert set(robot.seen) == {(0.0,)}
