@@ -426,7 +426,8 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
     ended_s = time.monotonic() - begun
     row = (
         f"p50 {p50[0]:.2f} -> {p50[1]:.2f} ms, p90 {p90[0]:.2f} -> {p90[1]:.2f} ms, p99 "
-        f"{p99[0]:.2f} -> {p99[1]:.2f} ms"
+        f"{p99[0]:.2f} -> {p99[1]:.2f} ms, longest {alone[-1]:.1f} -> {beside[-1]:.1f} ms, "
+        f"{len(alone) / ROW_SECONDS:.0f} -> {len(beside) / ROW_SECONDS:.0f} calls a second"
     )
     compared = f"a load of {load.cores:.2f} cores" if attempt else "idle cores"
     row += (

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from in_memory_keys import ChangingKeys
 from PIL import Image
 
-from vlagents_ray.errors import TooManyRequests, UnsupportedImage
+from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnsupportedImage
 from vlagents_ray.images import codecs, jpeg_png
 from vlagents_ray.images.image_file import ImageFile
 from vlagents_ray.protocol import frame_layout
@@ -191,15 +191,21 @@ def test_memory_that_changes_between_two_readings_gives_the_later_image(whole: A
     assert request.obs.cameras["front"].shape == (224, 224, 3)
 
 
-def test_the_end_of_a_replica_cancels_a_message_that_waits(whole: Admission) -> None:
+@pytest.mark.parametrize("priority", ["robot", "simulation"])
+def test_a_message_that_waits_at_the_end_of_a_replica_gets_an_error(
+    whole: Admission, priority: str
+) -> None:
     go_on = threading.Event()
     for robot in (True, False):
         for _ in range(16):
             whole.submit(lambda: go_on.wait(30), robot)
-    waiting = message(whole).decode_on_thread(partial(decode_requests, frame("large")))
+    admission = message(whole)
+    admission.begin("reset", priority)
+    waiting = admission.decode_on_thread(partial(decode_requests, frame("large")))
     whole.close()
     go_on.set()
-    assert waiting.cancelled()
+    with pytest.raises(PolicyUnavailable, match="stopping"):
+        waiting.result(30)
 
 
 @pytest.mark.parametrize("is_long", [False, True])

@@ -238,7 +238,7 @@ class Admission:
         """Run `call` on a decoding thread; raise `PolicyUnavailable` after `close`."""
         with self._lock:
             if self._closed:
-                raise PolicyUnavailable("the replica is stopping; connect again")
+                raise _stopping()
             threads = self._threads.get(robot)
             if threads is None:
                 cores = thread_map.allowed()
@@ -500,22 +500,19 @@ class MessageAdmission(Budget):
         return result
 
     def decode_on_thread(self, read: Callable[[Budget], T]) -> Future[T]:
-        """Decode with `read` on a decoding thread, and return the future; raise
-        `PolicyUnavailable` after `close`.
+        """Decode with `read` on a decoding thread, and return the future, whose error is
+        `PolicyUnavailable` if the replica stops before; raise the same after `close`.
         """
         self._is_short = self._robot
         self._begin_again()
         job = self._admission.submit(lambda: self.decode_here(read), self._robot)
-        if not self._robot:
-            return job
-
         done: Future[T] = Future()
         jobs = [job]  # the attempts to decode the message
         done.add_done_callback(lambda _: jobs[-1].cancel())
 
         def finish(job: Future[T]) -> None:
             """Return the result, or decode a long message on the threads for others."""
-            error = None if job.cancelled() else job.exception()
+            error = _stopping() if job.cancelled() else job.exception()
             if isinstance(error, NeedsDecodingThread) and not done.cancelled():
                 self._is_short = False
                 self._begin_again()
@@ -526,8 +523,6 @@ class MessageAdmission(Budget):
                 else:
                     jobs[-1].add_done_callback(finish)
                     return
-            if job.cancelled():
-                done.cancel()
             if not done.set_running_or_notify_cancel():
                 return
             if error is None:
@@ -569,6 +564,10 @@ class MessageAdmission(Budget):
 
     def __del__(self) -> None:
         self.release()
+
+
+def _stopping() -> PolicyUnavailable:
+    return PolicyUnavailable("the replica is stopping; connect again")
 
 
 def image_bytes(request: Request) -> int:
