@@ -5,7 +5,7 @@ complete episode.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -54,7 +54,7 @@ _KEY_FRAMES = 2  # interval of key frames in frames, as in LeRobot, for quick ac
 class FinishedEpisode:
     """A complete episode of N frames, whose files are moved into the dataset."""
 
-    instruction: str
+    instructions: Sequence[str]  # the instruction of each frame
     features: dict[str, Any]  # descriptions of the features, as in `meta/info.json`
     # The values of each feature: (N, D) float32, (N,) of the feature's dtype, or (N,) objects for
     # texts.
@@ -158,7 +158,7 @@ class RunningEpisode:
             success[-1] = label == "success"
             rows |= outcome_rows(success, success)
         return FinishedEpisode(
-            self.instruction,
+            [self.instruction] * len(rows[ACTION]),
             self.features,
             rows,
             {key: images.result() for key, images in self.images.items()},

@@ -164,8 +164,8 @@ class Dataset:
         frames = len(episode.rows[ACTION])
         file_numbers = _file_numbers(number)
         first = int(self.info["total_frames"])
-        if episode.instruction not in self.tasks:
-            self.tasks.append(episode.instruction)
+        tasks = list(dict.fromkeys(episode.instructions))
+        self.tasks += [task for task in tasks if task not in self.tasks]
 
         index = np.arange(frames)
         rows = episode.rows | {
@@ -173,7 +173,7 @@ class Dataset:
             "frame_index": index,
             "episode_index": np.full(frames, number),
             "index": first + index,
-            "task_index": np.full(frames, self.tasks.index(episode.instruction)),
+            "task_index": np.array([self.tasks.index(task) for task in episode.instructions]),
         }
         numbers = {key: values for key, values in rows.items() if values.dtype != object}
         stats = {key: of_values(values.reshape(frames, -1)) for key, values in numbers.items()}
@@ -181,7 +181,7 @@ class Dataset:
 
         about: dict[str, Any] = {
             "episode_index": number,
-            "tasks": [episode.instruction],
+            "tasks": tasks,
             "length": frames,
         }
         if self.interventions:

@@ -172,11 +172,11 @@ class _Demonstration:
     """The N frames of one episode that go into the dataset."""
 
     case: CaseResults
-    episode: Episode
     contract: Contract  # contract of the environment
     actions: np.ndarray  # (N, A) actions
     rewards: np.ndarray  # (N,)
     success: np.ndarray  # (N,)
+    instructions: np.ndarray  # (N,) text
     parts: tuple[str, ...]  # parts of `observation.state`
     environment: tuple[str, ...]  # parts of `observation.environment_state`
     state: dict[str, np.ndarray]  # (N, D) values of each part
@@ -236,11 +236,11 @@ class _Selection:
 
         return _Demonstration(
             case,
-            episode,
             Contract.from_json(case.contract),
             trajectory.actions[:frames],
             trajectory.rewards[:frames],
             trajectory.success[:frames],
+            trajectory.instructions[:frames],
             tuple(chosen),
             tuple(environment),
             {name: values[:frames] for name, values in state.items()},
@@ -383,7 +383,7 @@ def _finished(
         link_or_copy(video, videos[key])
 
     return FinishedEpisode(
-        demonstration.episode.result.instruction, features, rows, images, videos, about
+        demonstration.instructions.tolist(), features, rows, images, videos, about
     )
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -116,6 +117,9 @@ def _stem(result: EpisodeResult) -> str:
 # mode.
 NO_VERSION = -1
 _STATE = "state/"  # prefix of the names of the state's arrays in the .npz file
+# The largest trajectory, unpacked, bytes: the file may come from another person, and an episode of
+# an hour at 50 Hz with 1,000 numbers in each state has 720 MB.
+_MOST_BYTES = 2**30
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,13 +138,14 @@ class Trajectory:
     cameras: tuple[str, ...]
     # (T,) int64: the version of the weights that chose each action, or NO_VERSION
     versions: np.ndarray
+    instructions: np.ndarray  # (T,) text: the instruction that the policy had at each step
 
     def to_bytes(self) -> bytes:
         """Encode the trajectory as an .npz file without pickled objects."""
         arrays: dict[str, Any] = {"cameras": np.array(self.cameras, str)}
         arrays |= {"actions": self.actions, "rewards": self.rewards, "success": self.success}
         arrays |= {_STATE + name: values for name, values in self.state.items()}
-        arrays["versions"] = self.versions
+        arrays |= {"versions": self.versions, "instructions": self.instructions}
         if self.gripper is not None:
             arrays["gripper"] = self.gripper
 
@@ -153,10 +158,15 @@ class Trajectory:
         """Read an .npz file that `to_bytes` made.
 
         Raises:
-            ConfigError: The file is missing, or does not contain a trajectory.
+            ConfigError: The file is missing, too large, or does not contain a trajectory.
         """
         storage.require_there(path)
         try:
+            with zipfile.ZipFile(path) as archive:
+                size = sum(member.file_size for member in archive.infolist())
+            if size > _MOST_BYTES:
+                raise ValueError(f"expected at most {_MOST_BYTES} unpacked bytes, got {size}")
+
             # Open the file here, since np.load does not close the file of a broken archive.
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 state = {}
@@ -175,9 +185,43 @@ class Trajectory:
                     gripper,
                     cameras,
                     file["versions"],
+                    file["instructions"],
                 )
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except (
+            OSError,
+            EOFError,
+            ValueError,
+            KeyError,
+            MemoryError,  # the header of an array declares a wrong size
+            zipfile.BadZipFile,
+            zlib.error,
+        ) as error:
             raise ConfigError(f"{path}: cannot be read as a trajectory ({error})") from error
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` unless each array has the type and the length that its comment
+        declares.
+        """
+        steps = len(self.actions) if self.actions.ndim else 0
+        form = [
+            ("actions", self.actions, "float32", 2, steps),
+            ("rewards", self.rewards, "float64", 1, steps),
+            ("success", self.success, "bool", 1, steps),
+            ("versions", self.versions, "int64", 1, steps),
+            ("instructions", self.instructions, "str", 1, steps),
+        ]
+        for name, values in self.state.items():
+            form.append((_STATE + name, values, "float32", max(1, values.ndim), steps + 1))
+        if self.gripper is not None:
+            form.append(("gripper", self.gripper, "float32", 1, steps + 1))
+
+        for name, values, kind, dimensions, length in form:
+            is_of_kind = values.dtype.kind == "U" if kind == "str" else values.dtype == kind
+            if not is_of_kind or values.ndim != dimensions or len(values) != length:
+                raise ValueError(
+                    f"{name}: expected {length} rows of {kind} in {dimensions} dimensions, got the "
+                    f"shape {values.shape} of {values.dtype}"
+                )
 
 
 class TrajectoryRecorder(EpisodeObserver):
@@ -186,12 +230,17 @@ class TrajectoryRecorder(EpisodeObserver):
     def __init__(self) -> None:
         self._states: list[dict[str, np.ndarray]] = []  # state of each observation
         self._grippers: list[float | None] = []  # gripper of each observation
-        # Action, reward, success and version of each step.
-        self._steps: list[tuple[np.ndarray, float, bool, int]] = []
+        # Action, reward, success, version and instruction of each step.
+        self._steps: list[tuple[np.ndarray, float, bool, int, str]] = []
         self._cameras: tuple[str, ...] = ()
         self._version = NO_VERSION
+        self._instruction = ""
         # The next version, and the number of steps until it applies.
         self._next: tuple[int, int] = (0, NO_VERSION)
+
+    def add_instruction(self, instruction: str) -> None:
+        """Add an instruction; it applies to the next actions."""
+        self._instruction = instruction
 
     def add_observation(self, obs: Obs) -> None:
         """Add an observation.
@@ -231,12 +280,14 @@ class TrajectoryRecorder(EpisodeObserver):
         if steps_until_next == 0:
             self._version = version
         self._next = steps_until_next - 1, version
-        self._steps.append((np.array(action, np.float32), reward, success, self._version))
+        self._steps.append(
+            (np.array(action, np.float32), reward, success, self._version, self._instruction)
+        )
 
     def finish(self) -> Trajectory:
         """Return the trajectory; if no action was executed, the shape of `actions` is (0, 0)."""
-        actions, rewards, success, versions = (
-            zip(*self._steps, strict=True) if self._steps else ((), (), (), ())
+        actions, rewards, success, versions, instructions = (
+            zip(*self._steps, strict=True) if self._steps else ((), (), (), (), ())
         )
 
         states = {}
@@ -252,6 +303,7 @@ class TrajectoryRecorder(EpisodeObserver):
             np.array(self._grippers, np.float32) if has_gripper else None,
             self._cameras,
             np.array(versions, np.int64),
+            np.array(instructions, str),
         )
 
 
@@ -351,6 +403,10 @@ class Recording(EpisodeRecorder):
     def needs_images(self) -> bool:
         """Whether a video or a trajectory may need the images of every step."""
         return self._wants_video != "none" or self._wants_trajectory != "none"
+
+    def add_instruction(self, instruction: str) -> None:
+        for observer in self._observers:
+            observer.add_instruction(instruction)
 
     def add_observation(self, obs: Obs) -> None:
         for observer in self._observers:

@@ -275,6 +275,7 @@ def run_episodes(
         keys, sessions, observers, observations, instructions, options, strict=True
     ):
         observer.add_observation(obs)
+        observer.add_instruction(text)
         timeliness = None if clock is None else Timeliness()
         stats = EpisodeStats(
             key,
@@ -363,6 +364,7 @@ class _Episode:
     def instructed(self, instruction: str) -> None:
         """Begin a further task, and drop the remaining plan of the previous task."""
         self.stats.instructions.append(instruction)
+        self.observer.add_instruction(instruction)
         self.ticks.clear()
         self._executor = self.new_executor(self._last)
 

@@ -177,6 +177,9 @@ class EpisodeObserver:
 
     request_info: Mapping[str, Any] = {}  # added to the `Obs.info` of every request to the policy
 
+    def add_instruction(self, instruction: str) -> None:
+        """Add the instruction of a task, with which the policy is reset, before its actions."""
+
     def add_observation(self, obs: Obs) -> None:
         """Add an observation; the first one is the observation of the reset."""
 
