@@ -49,6 +49,27 @@ def test_json_and_csv_hold_the_values_of_each_episode(results: Results, tmp_path
                 assert text == (str(value).lower() if column.type == "boolean" else str(value))
 
 
+@pytest.mark.parametrize("text", ["=HYPERLINK(1)", "+1", "-1", "@SUM(1)", "\t=1", "\r=1", "\n=1"])
+def test_no_text_of_a_table_is_a_formula_of_a_spreadsheet(
+    results: Results, tmp_path: Path, text: str
+) -> None:
+    [case, *others] = results.cases
+    episodes = []
+    for episode in case.episodes:
+        result = dataclasses.replace(
+            episode.result, instruction=text, error=text, ending=text, transport=text, weights=text
+        )
+        episodes.append(dataclasses.replace(episode, result=result, trajectory=text))
+    foreign = dataclasses.replace(case, policy=text, suite=text, episodes=tuple(episodes))
+    to_csv(results.among([foreign, *others]), tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            texts = [row[column.name] for column in COLUMNS if column.type in ("string", "json")]
+            assert not [cell for cell in texts if cell.startswith(text[0])]
+            if row["suite"]:
+                assert row["instruction"] == f"'{text}"
+
+
 @pytest.mark.parametrize("write", [to_json, to_csv])
 def test_a_table_is_a_file_in_a_folder_that_exists(
     results: Results, tmp_path: Path, write: Callable[[Results, Path], int]

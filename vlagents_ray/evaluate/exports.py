@@ -17,6 +17,10 @@ from vlagents_ray.evaluate.artifacts.storage import require_folder_of, whole
 from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results
 
+# First characters of a text that a spreadsheet reads as a formula, which could send the table to
+# another person: https://owasp.org/www-community/attacks/CSV_Injection
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
+
 Type = Literal["string", "integer", "number", "boolean", "time", "json"]
 
 
@@ -228,7 +232,7 @@ def to_json(results: Results, path: Path) -> int:
 
 def to_csv(results: Results, path: Path) -> int:
     """Write a header, and a line for each episode. None is written as an empty field, and a boolean
-    as `true` or `false`.
+    as `true` or `false`. A text that a spreadsheet would read as a formula begins with "'".
 
     Returns:
         The number of episodes.
@@ -244,6 +248,8 @@ def to_csv(results: Results, path: Path) -> int:
                     row[name] = str(value).lower()
                 elif isinstance(value, datetime):
                     row[name] = _text(value)
+                elif isinstance(value, str) and value.startswith(_FORMULA):
+                    row[name] = f"'{value}"
             writer.writerow(row)
             number += 1
     return number
