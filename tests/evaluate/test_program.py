@@ -20,6 +20,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.exports import rows
+from vlagents_ray.evaluate.plan import cases
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
@@ -28,7 +29,13 @@ from vlagents_ray.evaluate.report.success import compare_all, families_json
 from vlagents_ray.evaluate.results.combination import combined
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
-from vlagents_ray.policies.base.program import code_of_class, digest_of, files_named
+from vlagents_ray.policies.base.program import (
+    SOFTWARE,
+    code_of_class,
+    digest_of,
+    files_named,
+    software,
+)
 from vlagents_ray_results.merge import merge
 
 FILES = {
@@ -90,6 +97,7 @@ def played(
     stated: dict[str, Any] | None = None,
     description: dict[str, Any] | None = None,
     contract: dict[str, Any] | None = None,
+    versions: dict[str, Any] | None = None,
     **changes: Any,
 ) -> EvalConfig:
     """Run the episodes of a plan that have no result, without a simulator."""
@@ -102,7 +110,7 @@ def played(
     config = flat_config(**{**settings, "out": out, **changes})
     said = served(own_weights) | (stated or {})
     with Store(resolve(config)) as store:
-        store.begin_run({})
+        store.begin_run(versions or {})
         for job in plan_jobs(store.cases):
             if str(job.key) in store.finished():
                 continue
@@ -319,6 +327,46 @@ def test_every_command_refuses_another_environment_unless_the_change_is_accepted
         command(tmp_path / "refused", change)
     found = command(tmp_path / "accepted", change, accept_changes=True)
     assert any(told.partition(" was")[0] in str(one) for one in found.accepted_changes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("name", sorted(software()))
+def test_every_command_refuses_other_software_unless_the_change_is_accepted(
+    work: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: Callable[..., Results],
+    name: str,
+) -> None:
+    def change() -> None:
+        monkeypatch.setattr(cases, "software", lambda: {**software(), name: "version 0"})
+
+    told = f"software: {name.removeprefix(SOFTWARE)} was "
+    with pytest.raises(
+        ConfigError, match=rf"(?s){re.escape(told)}.*is version 0.*--accept-changes"
+    ):
+        command(tmp_path / "refused", change)
+    monkeypatch.undo()
+    monkeypatch.syspath_prepend(str(work))
+    monkeypatch.chdir(work)
+    found = command(tmp_path / "accepted", change, accept_changes=True)
+    assert [str(one).startswith(told) for one in found.accepted_changes] == [True]
+
+
+def test_summary_and_page_show_the_versions_of_all_runs(work: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for number, version in enumerate(("0.0.8", "0.0.9", "0.0.9"), 1):
+        versions = {"vlagents-ray": version}
+        played(out, episodes=number, versions=versions, resume=number > 1)
+    assert summarize(Results.load(out)).to_json()["versions"] == [
+        {"runs": [1], "vlagents-ray": "0.0.8"},
+        {"runs": [2, 3], "vlagents-ray": "0.0.9"},
+    ]
+    page = write_report(Results.load(out), tmp_path / "page.html").read_text()
+    assert "Run 1<" in page
+    assert "Run 2, 3<" in page
+    assert "0.0.8" in page
 
 
 @pytest.mark.parametrize("command", COMMANDS)

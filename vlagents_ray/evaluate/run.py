@@ -244,7 +244,7 @@ class _Run(Consumer):
             tracking: The plan's trackers.
             only: As in `evaluate`.
             end_at: As in `evaluate`.
-            local_programs: The files of agents that the workers create, by policy.
+            local_programs: The programs of agents that the workers create, by policy.
             swaps: As in `evaluate`.
         """
         self._plan = plan

@@ -127,7 +127,7 @@ def test_a_summary_is_plain_json_with_all_that_made_it(summary: Summary) -> None
     assert written["config"]["suites"][0]["episodes"] == 3
     assert written["policies"] == {"act": {"policy": "act", "checkpoint": "a"}}
     assert [case["described"] for case in written["cases"]] == [{"simulator": "line"}, {}]
-    assert {"python", "ray", "numpy", "vlagents-ray", "code"} <= set(written["versions"])
+    assert {"python", "ray", "numpy", "vlagents-ray", "code"} <= set(written["versions"][0])
 
 
 def test_the_report_shows_rates_and_what_was_not_the_policys_fault(summary: Summary) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -26,7 +26,13 @@ from vlagents_ray.policies.base.checkpoint import (
     CHECKPOINT_STEP,
     checkpoint_name,
 )
-from vlagents_ray.policies.base.program import Program, code_of_class, files_named, with_defaults
+from vlagents_ray.policies.base.program import (
+    Program,
+    code_of_class,
+    files_named,
+    software,
+    with_defaults,
+)
 from vlagents_ray.registry import env_class, env_suite, env_task
 
 
@@ -125,7 +131,9 @@ class EvalCase:
 
     @cached_property
     def program(self) -> Program:
-        """The present files of the environment: its code, and the files that its settings name."""
+        """The software that runs the episodes, and the present files of the environment: its code,
+        and the files that its settings name.
+        """
         return env_program(self)
 
     @property
@@ -135,22 +143,37 @@ class EvalCase:
 
 
 def env_program(case: EvalCase, code: Callable[[str], Program] = code_of_class) -> Program:
-    """Return the files of a case's environment or robot; `code` returns the files of a class."""
+    """Return the software that runs the episodes of a case, and the files of its environment or
+    robot; `code` returns the files of a class.
+    """
     if case.robot is not None:
-        return code(case.on_robot[0].arm or "")
+        return software() | code(case.on_robot[0].arm or "")
+    files = files_of_env(case.env, case.suite.env_options, case.suite.reset_options, code)
+    return software() | files
 
-    cls = env_class(case.env)
+
+def files_of_env(
+    env: str,
+    env_options: Mapping[str, Any],
+    reset_options: Mapping[str, Any],
+    code: Callable[[str], Program] = code_of_class,
+) -> Program:
+    """Return the files of an environment, and the files that its settings name.
+
+    Raises:
+        UnknownEnv: The environment is not registered. `MissingDependency` is also raised.
+    """
+    cls = env_class(env)
     program = dict(code(f"{cls.__module__}:{cls.__name__}"))
 
     # For an environment of Gymnasium, add the module that registers its id.
-    task = env_task(case.env) or ""
+    task = env_task(env) or ""
     namespace = task.rpartition(":")[0] or task.rpartition("/")[0]
-    module = case.suite.env_options.get("module") or namespace
+    module = env_options.get("module") or namespace
     if isinstance(module, str):
         program |= code(module)
 
-    settings = with_defaults(cls, case.suite.env_options)
-    settings |= {"reset_options": case.suite.reset_options}
+    settings = with_defaults(cls, env_options) | {"reset_options": reset_options}
     return program | files_named(settings, folders=False)
 
 

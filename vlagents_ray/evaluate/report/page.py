@@ -334,7 +334,8 @@ class Configuration:
     # (policy id, checkpoint, commit, digest or version of the weights)
     checkpoints: list[tuple[str, str]]
     workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)
-    versions: list[Mapping[str, Any]]  # versions of packages for each folder
+    # (numbers of runs, their versions of packages)
+    versions: list[tuple[list[int], Mapping[str, Any]]]
     policies: list[tuple[str, str]]  # (name, metadata as YAML)
     settings: list[tuple[str, str]]  # (folder, settings as YAML)
 
@@ -396,9 +397,11 @@ def configuration(results: Results) -> Configuration:
         processes.setdefault(description, set()).add((worker.run, worker.pid))
 
     last_runs = _last_runs(results)
-    versions: list[Mapping[str, Any]] = []  # known versions for each folder
-    for run in last_runs:
-        versions.append({name: text for name, text in run.versions.items() if text is not None})
+    versions: list[tuple[list[int], Mapping[str, Any]]] = []
+    for numbers, of_runs in results.versions:
+        versions.append(
+            (numbers, {name: value for name, value in of_runs.items() if value is not None})
+        )
 
     return Configuration(
         runs=results.runs,

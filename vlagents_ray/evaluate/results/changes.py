@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from vlagents_ray.evaluate.plan.config import canonical, fingerprint
+from vlagents_ray.policies.base.program import SOFTWARE
 
 IDENTITY = ("policy", "checkpoint", "weights")  # names of fields in a policy's metadata
 # Settings that the field "checkpoint" already covers.
@@ -35,7 +36,7 @@ class EnvStatement(NamedTuple):
 class Change:
     """A file, a digest or a setting that differs from earlier episodes."""
 
-    subject: str  # "env my_envs:Reach", "policy pi0", or "plan"
+    subject: str  # "env my_envs:Reach", "policy pi0", "software", or "plan"
     name: str  # the name of the file or the setting
     was: str | None  # the earlier digest or value; None if there was no value
     now: str | None  # the present digest or value; None if there is no value
@@ -59,7 +60,7 @@ class Change:
         return self.subject == f"policy {policy}" and self.name.startswith("its ")
 
     def __str__(self) -> str:
-        return f"{self.subject}: {self.name} was {_short(self.was)}, is {_short(self.now)}"
+        return f"{self.subject}: {self.name} was {short(self.was)}, is {short(self.now)}"
 
 
 def listed(changes: Sequence[Change]) -> str:
@@ -70,13 +71,20 @@ def listed(changes: Sequence[Change]) -> str:
 def program_changes(
     subject: str, was: Mapping[str, str] | None, now: Mapping[str, str] | None
 ) -> list[Change]:
-    """Return the changes between the files of two programs; empty if one of the programs is
-    None.
+    """Return the changes between two programs; empty if one of the programs is None.
+
+    The subject of a change of the software that runs the episodes is "software", since it concerns
+    every environment.
     """
     if was is None or now is None:
         return []
-    names = sorted(name for name in was.keys() | now.keys() if was.get(name) != now.get(name))
-    return [Change(subject, name, was.get(name), now.get(name)) for name in names]
+    changes = []
+    for name in sorted(was.keys() | now.keys()):
+        if was.get(name) != now.get(name):
+            is_software = name.startswith(SOFTWARE) and subject.startswith("env ")
+            of = "software" if is_software else subject
+            changes.append(Change(of, name.removeprefix(SOFTWARE), was.get(name), now.get(name)))
+    return changes
 
 
 def env_changes(env: str, was: EnvStatement, now: EnvStatement) -> list[Change]:
@@ -188,7 +196,8 @@ def program_id(program: Mapping[str, str] | None) -> str | None:
     return fingerprint(dict(program)) if program else None
 
 
-def _short(value: str | None) -> str:
+def short(value: str | None) -> str:
+    """Return a value of a change for people, with the first digits of a digest."""
     if value is None:
         return "not there"
     method, colon, digits = value.rpartition(":")

@@ -214,6 +214,17 @@ class Results:
             changes += run.changes
         return list(dict.fromkeys(changes))
 
+    @property
+    def versions(self) -> list[tuple[list[int], dict[str, Any]]]:
+        """The versions of the software of all runs: the numbers of the runs that have the same
+        versions, and these versions.
+        """
+        runs_by_versions: dict[str, list[Run]] = {}
+        for run in self.runs:
+            text = json.dumps(run.versions, sort_keys=True)
+            runs_by_versions.setdefault(text, []).append(run)
+        return [([run.run for run in runs], runs[0].versions) for runs in runs_by_versions.values()]
+
     @classmethod
     def load(cls, out: str | Path) -> Results:
         """Read a folder of results.

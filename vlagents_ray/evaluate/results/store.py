@@ -351,9 +351,13 @@ class Store(AbstractContextManager["Store"]):
         """
         cases = [case for case in self.cases if case.place == place]
         env = cases[0].env
-        changes = program_changes(f"env {env}", cases[0].program, env_info.program)
-        # New files are allowed: the environment itself may write a file that its settings name.
-        if any(change.was is not None for change in changes):
+        changes = []
+        for change in program_changes(f"env {env}", cases[0].program, env_info.program):
+            # New files are allowed: the environment itself may write a file that its settings name.
+            # A worker may have its own packages (`runtime_env`).
+            if change.was is not None and change.subject != "software":
+                changes.append(change)
+        if changes:
             raise ConfigError(
                 f"expected the files of this process on the worker at {env_info.host}, got other "
                 f"files, or the files were edited since the start:\n{listed(changes)}\ngive both "

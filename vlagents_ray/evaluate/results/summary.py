@@ -217,7 +217,9 @@ class Summary:
             "accepted_changes": [asdict(change) for change in self.results.accepted_changes],
             "confidence_sequences": self.reasons_of_sequence,
             "policies": self.results.policies,
-            "versions": last_run.versions,
+            "versions": [
+                {"runs": numbers, **versions} for numbers, versions in self.results.versions
+            ],
             "config": last_run.config,
         }
 

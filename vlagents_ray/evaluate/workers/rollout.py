@@ -46,7 +46,8 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.accelerator import free_memory
 from vlagents_ray.policies.base.checkpoint import CHECKPOINT_STEP, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import identify_weights
-from vlagents_ray.policies.base.program import Program, code_of_class, files_named, loaded_code
+from vlagents_ray.policies.base.factory_values import factory_program
+from vlagents_ray.policies.base.program import Program, loaded_code
 from vlagents_ray.policies.wrapper import unwrapped
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.protocol.messages import PriorityName
@@ -391,23 +392,15 @@ def _agent(
 
 
 def factory_programs(plan: ResolvedPlan, own: OwnAgents) -> dict[str, Program]:
-    """Return the files of the agents that the workers create, by policy; for served policies, the
-    metadata contain the files.
+    """Return the programs of the agents that the workers create, by policy; for served policies,
+    the metadata contain the program.
+
+    A policy with pushed weights has none: its version and fingerprint identify it, and are checked
+    at each episode.
     """
+    unpushed = [policy.name for policy in plan.policies if policy.pushed_weights is None]
     if callable(own):
         program = factory_program(own)
-        return {policy.name: program for policy in plan.policies}
-    return {name: factory_program(make) for name, make in (own or {}).items()}
-
-
-def factory_program(make: Callable[..., Agent]) -> Program:
-    """Return the files of the module that defines `make`, and the files that the arguments of a
-    `partial` name.
-    """
-    settings: dict[str, Any] = {}
-    if isinstance(make, functools.partial):
-        arguments = {str(i): value for i, value in enumerate(make.args)}
-        settings = {**arguments, **make.keywords}
-        make = make.func
-    module = getattr(make, "__module__", None) or type(make).__module__
-    return code_of_class(module) | files_named(settings)
+        return dict.fromkeys(unpushed, program)
+    factories = own or {}
+    return {name: factory_program(factories[name]) for name in unpushed if name in factories}

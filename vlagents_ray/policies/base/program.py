@@ -1,25 +1,30 @@
-"""Digests of the files of a policy or an environment: its code, and the files in its settings."""
+"""The program of an episode: versions of software, digests of the files of a policy or an
+environment, and the values with which a factory makes a policy.
+"""
 
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import hashlib
 import inspect
 import json
+import platform
 import sys
 import sysconfig
 from collections.abc import Iterator, Mapping
 from importlib.machinery import ModuleSpec, PathFinder
-from importlib.metadata import packages_distributions, version
+from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from vlagents_ray.policies.base.checkpoint import STEP, at_step
 from vlagents_ray.policies.base.checkpoint_files import METHOD, digest, files_in
+from vlagents_ray.ray_tools.git_state import code_of
 
-# Classes of this package are identified by its version, which results record.
+# Classes of this package are identified by its version and commit (see `software`).
 _PACKAGE = "vlagents_ray"
 _LIBRARY_NAMES = ("stdlib", "platstdlib", "purelib", "platlib")
 _LIBRARIES = tuple(Path(sysconfig.get_path(name)).resolve() for name in _LIBRARY_NAMES)
@@ -28,8 +33,32 @@ _SITES = {"site-packages", "dist-packages"}
 _LISTED = 32
 _LONGEST = 4096  # length of the longest path, characters
 
-# Name of a file or a package -> digest, or the version of an installed package.
+# Name of a file, a package or a value -> digest of the file, version of the package, or the value.
 Program = dict[str, str]
+
+# The packages whose version can change every episode: this package has the loop of episodes, the
+# real-time clock, the built-in policies and environments, and numpy computes their numbers.
+_PACKAGES = ("vlagents-ray", "ray", "numpy", "torch")
+SOFTWARE = "software: "  # prefix of the names of their versions
+
+
+@functools.cache
+def software() -> Program:
+    """Return the versions of Python and of the installed packages that each episode depends on, and
+    the commit of this package.
+
+    Patch releases of Python are included. The commit is known only if git tracks the package.
+    """
+    program = {f"{SOFTWARE}python": f"version {platform.python_version()}"}
+    for name in _PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            program[f"{SOFTWARE}{name}"] = f"version {version(name)}"
+
+    code = code_of(_PACKAGE)
+    if code is not None:
+        changes = f", changes sha256:{code.diff_sha256}" if code.diff_sha256 else ""
+        program[f"{SOFTWARE}commit of vlagents-ray"] = code.commit + changes
+    return program
 
 
 def code_of_class(target: str) -> Program:
@@ -132,6 +161,16 @@ def with_defaults(cls: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]
         if parameter.default is not inspect.Parameter.empty:
             defaults[parameter.name] = parameter.default
     return {**defaults, **settings}
+
+
+def is_own_module(name: str) -> bool:
+    """Return whether a module belongs to the user, or has no file, such as a notebook; the modules
+    of this package, of installed packages and of the standard library do not.
+    """
+    if name.partition(".")[0] in (_PACKAGE, *sys.builtin_module_names, *sys.stdlib_module_names):
+        return name == "__main__"
+    file = _file(name)
+    return file is None or _is_own(file)
 
 
 def _file(name: str) -> Path | None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from vlagents_ray.bounds import MOST_BYTES, MOST_CPUS, MOST_ROWS, MOST_S, MOST_WORKERS
-from vlagents_ray.policies.base.program import Program, loaded_code
+from vlagents_ray.policies.base.program import Program, loaded_code, software
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.ray_tools.git_state import GitState, code_of
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
@@ -485,11 +485,11 @@ class ServerArgs(_DeploymentModel):
         return self.autoscaling.min_replicas
 
     def code(self) -> tuple[GitState | None, Program]:
-        """Return the git state of the policy's code, and the digests of the files of the policy and
-        its wrappers.
+        """Return the git state of the policy's code, and its program: versions of software, and the
+        digests of the files of the policy and its wrappers.
         """
         policy = target_of("policies", self.policy)
-        program = dict(loaded_code(policy))
+        program = software() | loaded_code(policy)
         for wrapper in self.wrappers:
             names = [wrapper] if isinstance(wrapper, str) else list(wrapper)
             for name in names:
