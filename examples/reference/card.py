@@ -39,7 +39,7 @@ instruction names other colours or another task, so that a policy that reads it 
 
 {rates}
 
-`vlagents-ray verify NAME.bundle.zip` checks these results.
+`vlagents-ray verify NAME.bundle.zip` reproduces these results.
 
 ## Training
 

@@ -71,5 +71,4 @@ def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (pair["a"], pair["b"], pair["lines"][-1]["suite"]) == ("b", "a", "all")
     assert sum(case["episodes"] for case in said["report"]["cases"]) == 4
     assert not (out / "report.html").exists()
-    assert said["verify"]["holds"] is True
-    assert {"subject", "verdict", "detail"} == said["verify"]["findings"][0].keys()
+    assert (said["verify"]["reproduced"], said["verify"]["tried"]) == (0, 0)

@@ -1,11 +1,11 @@
-"""An evaluation in one file, which other people can cite, check, replay in part, and merge with
-their own results.
+"""An evaluation in one file, which other people can cite, reproduce, and merge with their own
+results.
 
 The file is a ZIP archive whose first member lists the other members with their digests. An archive
 may come from a stranger. The list of members is checked before any member is read: each name is one
 that `pack` could have written, so that none leads out of the folder; no member is a link; the sizes
 are bounded, and no member yields more bytes than its declared size. Nothing is unpickled or
-imported. `verification` compares the content.
+imported. `verification` executes the recorded actions.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ MOST_BYTES = 16 * 10**9  # maximum number of bytes of all members, unpacked
 _MOST_MEMBERS = 200_000
 _MOST_MANIFEST = 64 * 2**20  # maximum size of the manifest, bytes
 _CHUNK = 2**20
+_SHOWN = 3  # maximum number of files in a message
 # A part of a path, as `naming.plain` creates names: it does not begin with a dot.
 _PART = r"[\w@-][\w.@-]{0,200}"
 _KNOWN = re.compile(
@@ -128,18 +129,15 @@ def require_file(archive: Path) -> None:
         )
 
 
-def unpack(
-    archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES
-) -> tuple[Manifest, str, list[str]]:
+def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> str:
     """Write the files of a bundle into `folder`, without its manifest.
 
     Returns:
-        The manifest, its SHA-256, and the differences between the manifest and the files, each as a
-        sentence.
+        The SHA-256 of the manifest, which identifies the content.
 
     Raises:
         ConfigError: The file is not a bundle, or is larger than allowed, or has a name that leads
-            out of `folder`.
+            out of `folder`, or has other files than its manifest lists.
     """
     require_file(archive)
     try:
@@ -161,12 +159,14 @@ def unpack(
         ) from error
 
     listed = manifest.files
-    differences = [f"{name} is not in the bundle" for name in listed.keys() - digests.keys()]
-    differences += [f"{name} is not in the manifest" for name in digests.keys() - listed.keys()]
-    for name in listed.keys() & digests.keys():
-        if listed[name] != digests[name]:
-            differences.append(f"{name} has another digest")
-    return manifest, sha256, sorted(differences)
+    names = listed.keys() | digests.keys()
+    differing = sorted(name for name in names if listed.get(name) != digests.get(name))
+    if differing:
+        raise ConfigError(
+            f"{archive}: expected the files that {MANIFEST} lists, got others "
+            f"({', '.join(differing[:_SHOWN])}); copy the bundle again from its source"
+        )
+    return sha256
 
 
 def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str, zipfile.ZipInfo]:
@@ -253,7 +253,7 @@ def _copy(
 
 
 def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
-    """Write the results in `folder` as one file that others can check (`verify`).
+    """Write the results in `folder` as one file that others can reproduce (`verify`).
 
     The bundle contains the present results.db, the differences from the commits, and the
     trajectories, with which episodes are replayed, but nothing that is computed from these. The

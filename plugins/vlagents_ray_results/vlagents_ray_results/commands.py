@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +11,9 @@ from vlagents_ray.bounds import MOST_EPISODES
 from vlagents_ray.cli.console import errors, out, print_json, table
 from vlagents_ray.cli.options import AsJson, finite
 from vlagents_ray.cli.results import Folder
+
+if TYPE_CHECKING:
+    from vlagents_ray_results.verification import Verification
 
 
 def merge_command(
@@ -56,7 +58,7 @@ def bundle_command(
         bool, typer.Option("--videos", help="Include the videos, which may be large.")
     ] = False,
 ) -> None:
-    """Write an evaluation as one file that others can verify: its database, the changes of the
+    """Write an evaluation as one file that others can reproduce: its database, the changes of the
     code since its commit, the trajectories, and digests of all files.
     """
     from vlagents_ray.evaluate.artifacts.storage import require_folder_of
@@ -74,14 +76,14 @@ def verify_command(
         Path, typer.Argument(metavar="BUNDLE", help="A file that `vlagents-ray bundle` wrote.")
     ],
     replay: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=0,
             max=MOST_EPISODES,
             metavar="N",
-            help="Number of episodes whose recorded actions are executed again.",
+            help="Execute the actions of N episodes, drawn at random; default: all episodes.",
         ),
-    ] = 3,
+    ] = None,
     seed: Annotated[
         int | None,
         typer.Option(
@@ -111,13 +113,14 @@ def verify_command(
     ] = 16.0,
     as_json: AsJson = False,
 ) -> None:
-    """Check a bundle, and print which parts are equal, differ, or could not be checked.
+    """Execute the recorded actions of a bundle here, without its policy, and print the success
+    rates of the reproduced episodes.
 
-    The bundle may come from a stranger. Different versions of software on this machine are listed,
-    but do not contradict the bundle.
+    An episode is reproduced if it ends here at the same step with the same outcome. The bundle may
+    come from a stranger.
 
-    Exit status: 0 if nothing contradicts the bundle, 1 if a digest, the table of results, a
-    recording or the outcome of a replay does.
+    Exit status: 0 if all executed episodes were reproduced, otherwise 1. `--replay 0` only unpacks
+    the bundle.
     """
     from vlagents_ray_results.verification import verify
 
@@ -125,25 +128,57 @@ def verify_command(
         verification = verify(
             bundle, into=into, replay=replay, seed=seed, trust=trust, most_bytes=int(max_gb * 1e9)
         )
-        if as_json:
-            print_json({"holds": verification.holds, **asdict(verification)})
-        else:
-            rows = table("what", "found", "detail", box=None)
-            for finding in verification.findings:
-                rows.add_row(finding.subject, finding.verdict, finding.detail)
-            out.print(rows)
+    if as_json:
+        print_json(verification.to_json())
+    else:
+        _print_verification(verification)
+        if into is not None:
+            out.print(f"results: {into}")
+    raise typer.Exit(not verification.is_complete and replay != 0)
 
-            unchecked = []
-            for finding in verification.findings:
-                if finding.verdict == "not checked":
-                    unchecked.append(finding.subject)
 
-            verdict = "is contradicted" if not verification.holds else "holds"
-            if unchecked:
-                verdict += f"; not checked: {', '.join(unchecked)}"
-            if "replay" not in unchecked:
-                out.print(f"\nreplayed episodes were drawn by --seed {verification.seed}")
-            out.print(f"bundle sha256:{verification.digest}: {verdict}")
-            if into is not None:
-                out.print(f"results: {into}")
-    raise typer.Exit(not verification.holds)
+def _print_verification(verification: Verification) -> None:
+    """Print the rates of the reproduced episodes, the other episodes with their reasons, and the
+    differences of the software.
+    """
+    from vlagents_ray.evaluate.results.changes import short
+
+    tried = len(verification.episodes)
+    others = [episode for episode in verification.episodes if not episode.is_reproduced]
+    if tried:
+        rates = table("policy", "env", "reproduced", "success in %", box=None)
+        if others:
+            rates.add_column("if the others had failed, or succeeded")
+        for rate in verification.rates:
+            success = rate.success_once
+            bounds = []
+            if others:
+                low, high = rate.with_others or (success.rate or 0.0, success.rate or 0.0)
+                bounds = [f"{100 * low:.0f} to {100 * high:.0f}%"]
+            episodes = f"{success.episodes} of {rate.tried}"
+            rates.add_row(rate.policy, rate.env, episodes, str(success), *bounds)
+        out.print(rates)
+
+    if others:
+        not_reproduced = table("not reproduced", "policy", "there and here", box=None)
+        for episode in others:
+            name = f"{episode.task}#{episode.episode}@{episode.seed}"
+            not_reproduced.add_row(name, episode.policy, episode.reason)
+        out.print()
+        out.print(not_reproduced)
+
+    drawn = ""
+    if tried < verification.counted:
+        drawn = f"; drawn from {verification.counted} by --seed {verification.seed}"
+    out.print(f"\n{verification.reproduced} of {tried} episodes reproduced{drawn}")
+    if verification.has_clock:
+        out.print(
+            "real-time mode: the executed actions were repeated; that the policy computed them in "
+            "time is not reproduced"
+        )
+    for change in verification.accepted_changes:
+        out.print(f"the author accepted a change between episodes: {change}")
+    for change in verification.differences:
+        there, here = short(change.was or "none"), short(change.now or "none")
+        out.print(f"differs: {change.subject}: {change.name}: {there} there, {here} here")
+    out.print(f"bundle sha256:{verification.digest}")

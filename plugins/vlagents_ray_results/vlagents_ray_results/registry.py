@@ -12,11 +12,11 @@ MERGE = RegistryEntry(
 )
 BUNDLE = RegistryEntry(
     "vlagents_ray_results.commands:bundle_command",
-    "Write an evaluation as one file that others can verify.",
+    "Write an evaluation as one file that others can reproduce.",
     examples=("bundle runs/first", "bundle runs/first --videos --out first.zip"),
 )
 VERIFY = RegistryEntry(
     "vlagents_ray_results.commands:verify_command",
-    "Check a bundle, and print what is equal or differs.",
+    "Execute the recorded actions of a bundle, and print the reproduced success rates.",
     examples=("verify first.bundle.zip", "verify first.bundle.zip --replay 10 --out runs/check"),
 )

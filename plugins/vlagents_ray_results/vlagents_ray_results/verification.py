@@ -1,13 +1,12 @@
-"""Checks of a bundle: its digests, its database, its recordings, and a replay of some episodes.
+"""Reproduction of a bundle: its recorded actions are executed here, and the success rates are
+computed from these episodes alone.
 
-A replay executes recorded actions in their environment, and compares the results; it needs no
-policy.
+No other part of a bundle is evidence: its author can write every column and every digest.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
+import contextlib
 import math
 import os
 import random
@@ -15,95 +14,156 @@ import re
 import secrets
 import sqlite3
 import tempfile
-import zipfile
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from itertools import islice, zip_longest
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import chain, islice, zip_longest
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
-import numpy as np
-
+from vlagents_ray.envs.base import BatchEnv, make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts import storage
-from vlagents_ray.evaluate.artifacts.recorder import NO_VERSION, Trajectory
-from vlagents_ray.evaluate.episode.records import Ending, EpisodeResult, Status
-from vlagents_ray.evaluate.plan.config import fingerprint
+from vlagents_ray.evaluate.artifacts.recorder import Trajectory
+from vlagents_ray.evaluate.episode.failures import env_side
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import files_of_env
+from vlagents_ray.evaluate.replay import DRIFT
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
+from vlagents_ray.evaluate.results.changes import Change, program_changes
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
-from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results, reading, table
-from vlagents_ray.evaluate.results.summary import summarize, write_summary
-from vlagents_ray.registry import env_suite, names
-from vlagents_ray_results.bundle import MANIFEST, MOST_BYTES, require_file, unpack
-from vlagents_ray_results.recorded_actions import replay_actions
+from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results, by_timing
+from vlagents_ray.evaluate.results.statistics import Rate
+from vlagents_ray.evaluate.results.summary import (
+    TOTAL,
+    Group,
+    group_of,
+    summarize,
+    write_summary,
+)
+from vlagents_ray.policies.base.program import Program, software
+from vlagents_ray.registry import env_suite, env_task, names
+from vlagents_ray_results.bundle import MOST_BYTES, require_file, unpack
+from vlagents_ray_results.recorded_actions import execute_actions
 
-Verdict = Literal["equal", "differs", "other here", "not checked"]
-MOST_TRAJECTORY = 2**30  # maximum size of a trajectory, unpacked, bytes
-# Relative tolerance: sums of floating-point numbers may differ in their last bits.
-_TOLERANCE = 1e-9
-_SHOWN = 3  # maximum number of differences in a finding
-_LENGTH = 80  # maximum number of characters of a value in a finding
+_LENGTH = 200  # maximum number of characters of a foreign text in a reason
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """The result of one check.
+class EpisodeVerification:
+    """An episode whose recorded actions were to be executed here."""
 
-    "differs" means that the bundle contradicts itself, or that a replay had another outcome. "other
-    here" means other software or numbers on this machine, which alone do not contradict the bundle.
-    """
+    policy: str  # policy id
+    task: str  # suite and env
+    episode: int
+    seed: int
+    is_reproduced: bool
+    reason: str | None  # why it is not reproduced: the outcomes there and here, or an error
 
-    subject: str
-    verdict: Verdict
-    detail: str
+
+@dataclass(frozen=True, slots=True)
+class ReproducedRate:
+    """The success rate of the reproduced episodes of a policy in an env, or in all envs."""
+
+    policy: str  # policy id
+    env: str
+    tried: int  # number of episodes whose actions were to be executed
+    success_once: Rate  # of the reproduced episodes alone
+    # The rates if all other episodes had failed, and if all had succeeded; None if there are none.
+    with_others: tuple[float, float] | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        rate = self.success_once.to_json()
+        return {
+            "policy": self.policy,
+            "env": self.env,
+            "tried": self.tried,
+            "success_once": rate,
+            "with_others": self.with_others,
+        }
 
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """The findings on a bundle."""
+    """The reproduction of a bundle."""
 
     digest: str  # SHA-256 of the bundle's manifest, which identifies its content
-    findings: list[Finding]
-    seed: int  # seed with which the replayed episodes were drawn
+    seed: int  # seed with which the episodes were drawn
+    counted: int  # number of episodes that the rates of the bundle include
+    episodes: tuple[EpisodeVerification, ...]
+    rates: tuple[ReproducedRate, ...]
+    # Versions of software and files of environments that differ from those here: "was" there, "is"
+    # here.
+    differences: tuple[Change, ...]
+    # Changes between the episodes, which the author accepted; a rate describes several programs.
+    accepted_changes: tuple[Change, ...]
+    has_clock: bool  # whether some of the episodes were run in real-time mode
 
     @property
-    def holds(self) -> bool:
-        """Whether nothing contradicts the bundle."""
-        return all(finding.verdict != "differs" for finding in self.findings)
+    def reproduced(self) -> int:
+        """The number of reproduced episodes."""
+        return sum(episode.is_reproduced for episode in self.episodes)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether there are episodes, and all of them were reproduced."""
+        return 0 < self.reproduced == len(self.episodes)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields for JSON, with `reproduced` and `tried`."""
+        return {
+            "digest": self.digest,
+            "seed": self.seed,
+            "counted": self.counted,
+            "tried": len(self.episodes),
+            "reproduced": self.reproduced,
+            "rates": [rate.to_json() for rate in self.rates],
+            "episodes": [asdict(episode) for episode in self.episodes],
+            "differences": [asdict(change) for change in self.differences],
+            "accepted_changes": [asdict(change) for change in self.accepted_changes],
+            "has_clock": self.has_clock,
+        }
 
 
 def verify(
     bundle: Path,
     *,
     into: Path | None = None,
-    replay: int = 3,
+    replay: int | None = None,
     seed: int | None = None,
     trust: bool = False,
     most_bytes: int = MOST_BYTES,
 ) -> Verification:
-    """Check a bundle, which may come from a stranger.
+    """Reproduce the episodes of a bundle, which may come from a stranger.
 
-    Nothing in it is run, imported or unpickled. Its environments are only created if they are
-    registered here and their options are numbers and words, unless `trust` is set.
+    An episode is reproduced if its recorded actions can be executed here, and instruction, ending,
+    number of steps, successes and return are the recorded ones (the return up to 1 %, because
+    rounding differs between machines). This shows that these actions solve these tasks. It does not
+    show that the policy chose them, in time, or that the bundle contains all episodes that its
+    author ran.
+
+    Nothing in the bundle is run, imported or unpickled. Its environments are only created if they
+    are registered here and their options are numbers and words, unless `trust` is set.
 
     Args:
         bundle: The file of the bundle.
         into: A new folder for the bundle's results, which can be read, merged and exported like any
             others; None removes the results. The folder's summary and report are written from the
             database.
-        replay: The number of episodes whose recorded actions are executed again.
+        replay: The number of episodes to execute, which are drawn from all that the rates include;
+            None: all.
         seed: The seed with which these episodes are drawn; None selects a new seed, which the
             author of the bundle cannot know.
         trust: Whether the bundle's environments may name any code and files.
         most_bytes: The maximum size of all files of the bundle, bytes.
 
     Returns:
-        The findings.
+        The reproduced episodes and their rates.
 
     Raises:
-        ConfigError: The file is not a bundle or is larger than allowed, its database cannot be
-            read, or `into` exists.
+        ConfigError: The file is not a bundle, is damaged or is larger than allowed, its database
+            cannot be read, or `into` exists.
         StorageFailed: The disk is full, or cannot be written to.
     """
     if into is not None and into.exists():
@@ -120,13 +180,9 @@ def verify(
             # The report contains the folder's name.
             folder = Path(temporary) / (into or bundle).name
             folder.mkdir()
-
-            manifest, digest, differences = unpack(bundle, folder, most_bytes=most_bytes)
-            fine = f"{len(manifest.files)} files have the SHA-256 listed in {MANIFEST}"
-            findings = [_finding("digests", differences, fine)]
-
+            digest = unpack(bundle, folder, most_bytes=most_bytes)
             try:
-                findings += _check(folder, replay, seed, trust=trust)
+                verification = _reproduce(folder, digest, replay, seed, trust=trust)
             except (VLAgentsError, sqlite3.Error):
                 raise
             except (
@@ -144,11 +200,13 @@ def verify(
 
             if into is not None:
                 os.replace(folder, into)
-    return Verification(digest, findings, seed)
+    return verification
 
 
-def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Finding]:
-    """Yield all findings except that about the digests; also write summary and report."""
+def _reproduce(
+    folder: Path, digest: str, replay: int | None, seed: int, *, trust: bool
+) -> Verification:
+    """Execute the actions of the drawn episodes; also write summary and report."""
     if not (folder / DATABASE).is_file():
         raise ConfigError(
             f"expected a bundle that `vlagents-ray bundle` wrote, got one without {DATABASE}"
@@ -156,386 +214,236 @@ def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Fin
     results = Results.load(folder)
     if not results.runs or not results.cases:
         raise ConfigError(f"{DATABASE}: expected the results of an evaluation, got none")
-
-    yield _check_cases(results)
-    yield _check_episodes(results)
+    _require_distinct(results)
     write_summary(summarize(results))
     write_report(results, folder / REPORT)
-    yield _check_trajectories(results)
-    yield _check_versions(results)
-    if not replay:
-        yield Finding("replay", "not checked", "was not requested (--replay 0)")
-        return
 
-    chosen = list(islice(_drawn_recordings(results, seed), replay))
-    if not chosen:
-        yield Finding(
-            "replay", "not checked", "no finished episode has a recording (eval --record all)"
-        )
-    for case, episode, trajectory in chosen:
-        yield _replay(case, episode, trajectory, trust=trust)
-
-
-def _drawn_recordings(
-    results: Results, seed: int
-) -> Iterator[tuple[CaseResults, Episode, Trajectory]]:
-    """Yield the drawn episodes that have a recording."""
-    for case, episode in _drawn(results, seed):
-        trajectory = _recorded(results, episode)
-        if trajectory is not None:
-            yield case, episode, trajectory
-
-
-def _drawn(results: Results, seed: int) -> Iterator[tuple[CaseResults, Episode]]:
-    """Yield the finished episodes in a random order, one of each case in turn, so that each case is
-    checked.
-    """
-    draw = random.Random(seed)
-    cases = []
-    for case in results.cases:
-        done = [episode for episode in case.episodes if episode.result.status == "done"]
-        cases.append([(case, episode) for episode in done])
-
-    draw.shuffle(cases)
-    for episodes in cases:
-        draw.shuffle(episodes)
-    for turn in zip_longest(*cases):
-        yield from (pair for pair in turn if pair is not None)
-
-
-def _check_cases(results: Results) -> Finding:
-    """Check that the keys of cases and episodes match their settings, and that nothing was mixed or
-    left out.
-    """
-    contradictions = []
-    known_keys: set[str] = set()
-    rules = {json.dumps(run.config.get("stop"), sort_keys=True) for run in results.runs}
-    for case in results.cases:
-        name = f"{case.policy_id} in {case.task}"
-        env_and_policy = case.settings.get("env"), case.settings.get("policy")
-        has_fingerprint = fingerprint(case.settings) == case.case_id
-        if not has_fingerprint or env_and_policy != (case.env, case.policy):
-            contradictions.append(f"{name}: its settings are not those of its key")
-        rule = None if case.stop is None else case.stop.model_dump(mode="json")
-        if json.dumps(rule, sort_keys=True) not in rules:
-            contradictions.append(f"{name}: no run stopped early by its rule")
-        for episode in case.episodes:
+    episodes: list[EpisodeVerification] = []
+    executed_cases: list[CaseResults] = []
+    for case, drawn in zip(results.cases, _drawn(results, replay, seed), strict=True):
+        executed: list[Episode] = []
+        for episode, here, reason in _executed(results, case, drawn, trust=trust):
             key = episode.result.key
-            known_keys.add(str(key))
-            if key.env != case.env:
-                contradictions.append(f"{key}: is of another case or env")
-        contradictions += [f"{name}: {text}" for text in _mixtures(results, case)]
+            episodes.append(
+                EpisodeVerification(
+                    case.policy_id, case.task, key.episode, key.seed, reason is None, reason
+                )
+            )
+            # The rates treat an episode that is not reproduced like one without a result.
+            is_reproduced = here is not None and reason is None
+            result = here if is_reproduced and here else EpisodeResult(key, "infra_failed")
+            executed.append(replace(episode, result=result))
+        if drawn:
+            executed_cases.append(
+                replace(case, planned=len(drawn), episodes=tuple(executed), attempts=())
+            )
 
-    with reading(results.out) as db:
-        keys = {row["key"] for row in table(db, "episodes")}
-    for unknown_key in sorted(keys - known_keys):
-        contradictions.append(
-            f"{unknown_key}: its key does not match its columns, or it has no case"
-        )
-
-    return _finding(
-        "database",
-        contradictions,
-        f"keys match the settings of all cases ({len(results.cases)}) and episodes ({len(keys)})",
+    differences: dict[Change, None] = {}
+    for case in results.cases:
+        differences |= dict.fromkeys(_differences(case, trust=trust))
+    return Verification(
+        digest,
+        seed,
+        len(results.counted),
+        tuple(episodes),
+        tuple(_rates(results.among(executed_cases))),
+        tuple(differences),
+        tuple(results.accepted_changes),
+        any(case.settings.get("clock") is not None for case in executed_cases),
     )
 
 
-# All episodes of a case have the same value in each of these columns. A run whose change was
-# accepted may have added another value, but no other checkpoint.
-_ONE_OF_A_CASE = ("checkpoint", "weights", "env_program", "policy_program")
-
-
-def _mixtures(results: Results, case: CaseResults) -> Iterator[str]:
-    """Yield differences between the episodes of a case that no evaluation would have written."""
-    for column in _ONE_OF_A_CASE:
-        if results.accepted_changes and column != "checkpoint":
-            continue
-        if column.endswith("_program"):
-            values = {getattr(episode, column) for episode in case.episodes if episode.counts}
-        else:  # the value is unknown for an episode that failed in the policy's reset
-            values = {getattr(episode.result, column) for episode in case.episodes} - {None}
-        if len(values) > 1:
-            yield (
-                f"its episodes have {len(values)} values of {column}, and no accepted change "
-                "says so"
-            )
-
-    fingerprints_by_version: dict[int, set[str]] = {}
-    for episode in case.episodes:
-        result = episode.result
-        if result.policy_version is not None and result.policy_fingerprint is not None:
-            fingerprints = fingerprints_by_version.setdefault(result.policy_version, set())
-            fingerprints.add(result.policy_fingerprint)
-    for version, fingerprints in fingerprints_by_version.items():
-        if len(fingerprints) > 1:
-            yield f"version {version} of the weights has {len(fingerprints)} fingerprints"
-
-    has_unplanned = any(episode.unplanned for episode in case.episodes)
-    plan_changed = any(change.subject == "plan" for change in results.accepted_changes)
-    if has_unplanned and not plan_changed:
-        yield (
-            "it has episodes beyond its plan, in no rate, and no accepted change says that the "
-            "plan became smaller"
-        )
-
-
-def _check_episodes(results: Results) -> Finding:
-    """Check that the columns of each episode do not contradict each other."""
-    contradictions: list[str] = []
-    runs = {run.run for run in results.runs}
-    recordings: dict[str, int] = {}  # the number of episodes by path of the recording
-    number = 0
-    for case in results.cases:
-        for episode in case.episodes:
-            number += 1
-            texts = list(_inconsistencies(case, episode))
-            if episode.run not in runs:
-                texts.append(f"there is no run {episode.run}")
-            contradictions += [f"{episode.result.key}: {text}" for text in texts]
-            if episode.trajectory is not None:
-                recordings[episode.trajectory] = recordings.get(episode.trajectory, 0) + 1
-
-    for recording, times in recordings.items():
-        if times > 1:
-            contradictions.append(f"{recording}: is the recording of {times} episodes")
-
-    files = (results.out / storage.TRAJECTORIES).rglob("*.npz")
-    for name in sorted(str(file.relative_to(results.out)) for file in files):
-        if name not in recordings:
-            contradictions.append(f"{name}: is the recording of no episode")
-
-    return _finding("episodes", contradictions, f"the columns of {number} episodes are consistent")
-
-
-def _inconsistencies(case: CaseResults, episode: Episode) -> Iterator[str]:
-    """Yield the contradictions between the columns of one episode."""
-    result = episode.result
-    outcome = (result.success_once, result.success_at_end, result.first_success)
-    if result.status not in get_args(Status) or result.ending not in get_args(Ending):
-        yield (
-            f"got the status {result.status!r} and the ending {result.ending!r}, which no "
-            "evaluation writes"
-        )
-    is_done = result.status == "done"
-    if is_done != (result.error is None) or is_done != (result.ending != "error"):
-        yield f"its error or ending ({result.ending}) contradicts its status {result.status!r}"
-    if result.status == "infra_failed":
-        if outcome != (None, None, None) or result.steps or result.actions_sha256 is not None:
-            yield "it failed by infrastructure, but has an outcome"
-        if episode.trajectory is not None:
-            yield "it failed by infrastructure, but has a recording"
-        return
-
-    if result.status == "policy_error" and outcome != (False, False, None):
-        yield "an error of the policy ended it, but it was solved"
-
-    solved_after = result.first_success
-    if None in outcome[:2] or result.success_once != (solved_after is not None):
-        yield "success_once contradicts first_success"
-    elif solved_after is not None and not 1 <= solved_after <= result.steps:
-        yield f"it was solved after {solved_after} of {result.steps} steps"
-    elif (result.success_at_end and not result.success_once) or (
-        solved_after is not None and solved_after == result.steps and not result.success_at_end
-    ):
-        yield "success_at_end contradicts first_success"
-
-    pushed = case.settings.get("pushed_weights")
-    acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
-    if pushed and result.policy_version is not None:
-        expected = (pushed["version"], pushed["version"], pushed["fingerprint"])
-        if acted != expected:
-            yield (
-                f"versions {acted[0]} to {acted[1]} ({acted[2]}) acted, not {expected[0]} "
-                f"({expected[2]})"
-            )
-
-    yield from _inconsistent_ticks(case, result)
-
-
-def _inconsistent_ticks(case: CaseResults, result: EpisodeResult) -> Iterator[str]:
-    """Yield the contradictions between the columns about ticks, and with the clock of the case."""
-    has_clock = case.settings.get("clock") is not None
-    if not has_clock and (result.ticks_waited, result.latency_ms) != (0, None):
-        yield "it waited for answers, but its environment did not advance in the meantime"
-
-    ages_ms = [result.age_p50_ms, result.age_p95_ms, result.age_p99_ms]
-    known_ages_ms = [age_ms for age_ms in ages_ms if age_ms is not None]
-    time_share = result.time_share
-    if not has_clock and case.settings.get("robot") is None:
-        if (result.ticks, result.starved, known_ages_ms) != (None, None, []):
-            yield "it has ticks in time, but its environment waited for the policy"
-        return
-    if time_share is None:
-        yield "its ticks are missing"
-        return
-
-    ticks, starved = time_share.ticks, time_share.starved
-    if has_clock and (ticks != result.steps or not starved <= result.ticks_waited <= ticks):
-        yield (
-            f"{starved} starved of {ticks} ticks, {result.ticks_waited} waited, of "
-            f"{result.steps} steps"
-        )
-    if not 0 <= starved <= ticks:
-        yield f"{starved} starved of {ticks} ticks"
-    has_ages = [True] * 3 if known_ages_ms else [False] * 3
-    if [age_ms is not None for age_ms in ages_ms] != has_ages:
-        yield f"it has some of the ages {ages_ms}, but not all"
-    if known_ages_ms != sorted(known_ages_ms) or min(known_ages_ms, default=0.0) < 0:
-        yield f"expected ages in ascending order, none below 0 ms, got {known_ages_ms}"
-    if has_clock and bool(known_ages_ms) != (starved < ticks):
-        yield f"{ticks - starved} ticks in time, but the ages {ages_ms}"
-
-
-def _check_trajectories(results: Results) -> Finding:
-    """Check that each recording has the actions, steps, rewards and success of its episode in
-    the table.
+def _require_distinct(results: Results) -> None:
+    """Raise `ConfigError` if the database has an episode several times, which would count it
+    several times.
     """
-    contradictions: list[str] = []
-    checked, missing = 0, 0
+    known = set()
     for case in results.cases:
-        for episode in case.episodes:
-            if episode.result.status == "infra_failed":
-                continue
-            trajectory = _recorded(results, episode)
-            if trajectory is None:
-                missing += 1
-                continue
-
-            checked += 1
-            synchronous = case.settings.get("clock") is None
-            texts = _contradictions(episode, trajectory, synchronous=synchronous)
-            contradictions += [f"{episode.result.key}: {text}" for text in texts]
-
-    if not checked and not contradictions:
-        return Finding(
-            "trajectories",
-            "not checked",
-            f"the bundle has none of {missing} episodes (eval --record all)",
-        )
-    fine = f"{checked} match the actions, rewards and outcomes in the database"
-    if missing:
-        fine += f"; {missing} others have no recording, so their outcomes cannot be checked"
-    return _finding("trajectories", contradictions, fine)
+        for episode in case.counted_episodes:
+            key = episode.result.key
+            name = (case.policy_id, case.task, key.episode, key.seed)
+            if name in known:
+                raise ConfigError(
+                    f"{DATABASE}: has the episode {key.episode} with the seed {key.seed} of "
+                    f"{case.policy_id} in {case.task} twice, which no evaluation writes; do not "
+                    "trust its author"
+                )
+            known.add(name)
 
 
-def _recorded(results: Results, episode: Episode) -> Trajectory | None:
-    """Return the recording of an episode; None if the bundle has none. Raises `ConfigError` if
-    it cannot be read.
+def _drawn(results: Results, number: int | None, seed: int) -> list[list[Episode]]:
+    """Return the drawn episodes of each case, in their order.
+
+    The number of episodes is equal for all cases that have as many, so that each case is tried.
     """
-    if episode.trajectory is None:
-        return None
-    path = results.file(episode.trajectory)
-    if not path.is_file():
-        return None
+    by_case = [list(case.counted_episodes) for case in results.cases]
+    if number is None:
+        return by_case
 
+    draw = random.Random(seed)
+    shuffled = []
+    for index, episodes in enumerate(by_case):
+        draw.shuffle(episodes)
+        shuffled.append([(index, episode) for episode in episodes])
+    draw.shuffle(shuffled)
+
+    in_turn = (pair for pair in chain.from_iterable(zip_longest(*shuffled)) if pair is not None)
+    drawn: list[list[Episode]] = [[] for _ in by_case]
+    for index, episode in islice(in_turn, number):
+        drawn[index].append(episode)
+    return drawn
+
+
+def _executed(
+    results: Results, case: CaseResults, episodes: Iterable[Episode], *, trust: bool
+) -> Iterator[tuple[Episode, EpisodeResult | None, str | None]]:
+    """Execute the actions of these episodes, one after the other in one environment.
+
+    Yields:
+        The episode, its result here (None if there is none), and the reason why it is not
+        reproduced (None if it is).
+    """
+    env: BatchEnv | None = None
     try:
-        with zipfile.ZipFile(path) as file:
-            size = sum(member.file_size for member in file.infolist())
-    except (OSError, zipfile.BadZipFile) as error:
-        raise ConfigError(
-            f"{episode.trajectory}: cannot be read as a trajectory ({error})"
-        ) from error
-    if size > MOST_TRAJECTORY:
-        raise ConfigError(
-            f"{episode.trajectory}: expected at most {MOST_TRAJECTORY} unpacked bytes, got {size}"
-        )
+        for episode in episodes:
+            try:
+                actions = _recorded_actions(results, episode)
+            except ConfigError as error:
+                yield episode, None, _cut(str(error))
+                continue
+            try:
+                env = env or _make(case, trust=trust)
+            except VLAgentsError as error:
+                yield episode, None, f"could not be executed: {_cut(str(error))}"
+                continue
+            try:
+                here = execute_actions(
+                    env,
+                    episode.result.key,
+                    actions,
+                    reset_options=case.settings.get("reset_options"),
+                )
+            except VLAgentsError as error:
+                yield episode, None, f"{_in_words(episode.result)} there, here: {_cut(str(error))}"
+                _close(env)  # a simulator that failed may be broken
+                env = None
+                continue
+            yield episode, here, _difference(episode.result, here, len(actions))
+    finally:
+        if env is not None:
+            _close(env)
 
-    try:
-        return Trajectory.load(path)
-    except MemoryError as error:  # the file's header declares a wrong size
-        raise ConfigError(
-            f"{episode.trajectory}: declares a size that does not fit into memory"
-        ) from error
 
+def _recorded_actions(results: Results, episode: Episode) -> Sequence[Any]:
+    """Return the recorded actions of an episode, (D,) each.
 
-def _contradictions(
-    episode: Episode, trajectory: Trajectory, *, synchronous: bool
-) -> Iterator[str]:
-    """Yield the contradictions between a recording and its episode in the table."""
+    Raises:
+        ConfigError: There are none, or they cannot be read, or they cannot have the episode's
+            outcome.
+    """
     result = episode.result
-    steps = len(trajectory.actions)
-    if not _has_one_length(trajectory) or result.steps != steps:
-        yield f"{result.steps} steps in the table, another number in the recording"
-        return
-
-    actions = np.ascontiguousarray(trajectory.actions, "<f4").tobytes()
-    if hashlib.sha256(actions).hexdigest() != result.actions_sha256:
-        yield "the recorded actions do not match the digest in the table"
-    total = float(sum(trajectory.rewards.tolist()))
-    if not math.isclose(total, result.episode_return, rel_tol=_TOLERANCE, abs_tol=1e-12):
-        yield "the recorded rewards have another sum"
-
-    # An episode that ended with an error of the policy counts as unsuccessful, whatever was
-    # recorded.
     if result.status != "done":
-        return
-    outcome = (result.success_once, result.success_at_end, result.first_success)
-    if _outcome(trajectory.success.astype(bool).tolist()) != outcome:
-        yield "the recorded success differs from the table"
-    versions = [int(version) for version in trajectory.versions if version != NO_VERSION]
-    acted = (versions[0], versions[-1]) if versions else (None, None)
-    # In real-time mode, an answer may remain unused.
-    if synchronous and acted != (result.first_policy_version, result.policy_version):
-        yield "the recorded versions of the weights differ from the table"
+        raise ConfigError(f"{_in_words(result)} there, which actions cannot reproduce")
+    if episode.trajectory is None:
+        raise ConfigError("no actions were recorded (eval --record all)")
+    actions = Trajectory.load(results.file(episode.trajectory)).actions
+    if not len(actions):
+        raise ConfigError("its recording has no actions")
+    return list(actions)
 
 
-def _has_one_length(trajectory: Trajectory) -> bool:
-    """Return whether each step has an action, a reward, a success and a version, and each
-    observation has its numbers.
+def _make(case: CaseResults, *, trust: bool) -> BatchEnv:
+    """Create the environment of a case.
+
+    Raises:
+        ConfigError: The case is on a robot, or its environment is not registered here, or its
+            options could name files or code and `trust` is off. Other errors of `make_batch` are
+            also raised.
     """
-    steps = len(trajectory.actions)
-    of_steps = [
-        values.shape for values in (trajectory.rewards, trajectory.success, trajectory.versions)
-    ]
-    of_observations = [len(values) for values in trajectory.state.values()]
-    if trajectory.gripper is not None:
-        of_observations.append(trajectory.gripper.size)
-    return set(of_steps) == {(steps,)} and set(of_observations) <= {steps + 1}
+    if case.settings.get("robot") is not None:
+        raise ConfigError("it was run on a real robot")
+    if not trust:
+        require_harmless(case)
+    with env_side("make"):
+        return make_batch(case.env, 1, **(case.settings.get("env_options") or {}))
 
 
-def _outcome(success: list[bool]) -> tuple[bool, bool, int | None]:
-    """Return whether the task was solved once, whether it was solved at the end, and the number of
-    steps after which it was first solved.
+def _close(env: BatchEnv) -> None:
+    with contextlib.suppress(VLAgentsError), env_side("close"):
+        env.close()
+
+
+def _difference(there: EpisodeResult, here: EpisodeResult, recorded: int) -> str | None:
+    """Return the outcomes of an episode there and here; None if they are equal, and all `recorded`
+    actions were executed.
     """
-    first = next((number for number, solved in enumerate(success, 1) if solved), None)
-    return first is not None, bool(success and success[-1]), first
+    for name in ("success_once", "success_at_end", "first_success", "steps", "ending", "status"):
+        if getattr(there, name) != getattr(here, name):
+            return f"{_in_words(there)} there, {_in_words(here)} here"
+    if here.steps != recorded:
+        return f"{recorded} recorded actions there, {_in_words(here)} here"
+    if there.instruction != here.instruction:
+        return f"{_cut(there.instruction)!r} there, {_cut(here.instruction)!r} here"
+    returns = there.episode_return, here.episode_return
+    if not math.isclose(*returns, rel_tol=DRIFT, abs_tol=DRIFT):
+        return f"return {returns[0]:.6g} there, {returns[1]:.6g} here"
+    return None
 
 
-def _finding(subject: str, contradictions: list[str], fine: str) -> Finding:
-    """Return the finding of a check: the first contradictions, or `fine` if there are none."""
-    if not contradictions:
-        return Finding(subject, "equal", fine)
-    more = f"; and {len(contradictions) - _SHOWN} more" if len(contradictions) > _SHOWN else ""
-    return Finding(subject, "differs", "; ".join(contradictions[:_SHOWN]) + more)
+def _in_words(result: EpisodeResult) -> str:
+    """Return the outcome of an episode: "solved at step 5, truncated after 20 steps"."""
+    if result.status != "done":
+        return f"an error of the policy after {result.steps} steps ({_cut(result.error or '')})"
+    solved = "not solved"
+    if result.success_once:
+        solved = f"solved at step {result.first_success}"
+        if not result.success_at_end:
+            solved += ", not at the end"
+    return f"{solved}, {result.ending.replace('_', ' ')} after {result.steps} steps"
 
 
-def _check_versions(results: Results) -> Finding:
-    """Compare the software of the last run with the software of this machine."""
-    run_versions = results.runs[-1].versions
-    local_versions = storage.versions()
-    pairs = {}
-    for name, version in local_versions.items():
-        if name != "code":
-            pairs[name] = (run_versions.get(name), version)
-    pairs["commit"] = (_commit(run_versions), _commit(local_versions))
-
-    differences = []
-    for name, (run_version, local_version) in pairs.items():
-        if run_version != local_version:
-            differences.append(f"{name} {run_version} there, {local_version} here")
-    if differences:
-        return Finding("versions", "other here", "; ".join(differences))
-
-    texts = [f"{name} {version}" for name, (_, version) in pairs.items()]
-    return Finding("versions", "equal", ", ".join(texts))
+def _cut(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= _LENGTH else f"{line[:_LENGTH]}…"
 
 
-def _commit(versions: Mapping[str, Any]) -> str:
-    code = versions.get("code")
-    state = code.get("vlagents_ray") if isinstance(code, dict) else None
-    if not isinstance(state, dict) or state.get("commit") is None:
-        return "unknown"
-    return f"{state['commit']} with changes" if state.get("diff_sha256") else str(state["commit"])
+def _rates(results: Results) -> Iterator[ReproducedRate]:
+    """Yield the rate of each case and, for a policy with several cases, of its cases with the same
+    clock.
+    """
+    for policy_id in results.policy_ids:
+        cases = results.of(policy_id)
+        for case in cases:
+            yield _rate(group_of((policy_id, case.suite, case.env), [case]), case.task)
+        if len(cases) > 1:
+            for timing, members in by_timing(cases).items():
+                group = group_of((policy_id, "", TOTAL), members)
+                yield _rate(group, f"{TOTAL}, {timing}")
+
+
+def _rate(group: Group, env: str) -> ReproducedRate:
+    bounds = group.with_lost(group.success_once)
+    return ReproducedRate(group.policy_id, env, group.planned, group.success_once, bounds)
+
+
+def _differences(case: CaseResults, *, trust: bool) -> list[Change]:
+    """Return the versions of software, and the files of the case's environment, that are not those
+    here.
+    """
+    here: Program = software()
+    there: Program = {name: case.program.get(name, "") for name in here}
+    if case.settings.get("robot") is None:
+        # The episodes report an environment that cannot be created here.
+        with contextlib.suppress(VLAgentsError):
+            if not trust:
+                require_harmless(case)
+            here = here | files_of_env(
+                case.env,
+                case.settings.get("env_options") or {},
+                case.settings.get("reset_options") or {},
+            )
+            there = case.program
+    return program_changes(f"env {case.env}", there, here)
 
 
 # Options that choose code, even if their values are words.
@@ -551,7 +459,9 @@ def require_harmless(case: CaseResults) -> None:
     path or a nested value could name files or code of this machine. `trust_remote_code` from a
     bundle is rejected: only the local user can grant it.
     """
-    if env_suite(case.env) not in names("envs") or ":" in case.env:
+    # Gymnasium imports the module before the slash of an id.
+    has_module = env_suite(case.env) == "gymnasium" and "/" in (env_task(case.env) or "")
+    if env_suite(case.env) not in names("envs") or ":" in case.env or has_module:
         raise ConfigError(
             f"{case.env}: is not a registered environment; --trust creates it, and runs its code"
         )
@@ -573,64 +483,3 @@ def _is_plain(value: object) -> bool:
     if isinstance(value, str):
         return _WORD.fullmatch(value) is not None
     return value is None or isinstance(value, bool | int | float)
-
-
-def _replay(case: CaseResults, episode: Episode, trajectory: Trajectory, *, trust: bool) -> Finding:
-    subject = f"replay of {case.env}#{episode.result.key.episode}@{episode.result.key.seed}"
-    if case.settings.get("robot") is not None:
-        return Finding(subject, "not checked", "it was played on a real robot")
-    if not _has_one_length(trajectory):
-        return Finding(
-            subject,
-            "differs",
-            "its recording has different numbers of actions and observations",
-        )
-
-    try:
-        if not trust:
-            require_harmless(case)
-        played = replay_actions(case, episode, trajectory)
-    except VLAgentsError as error:
-        return Finding(subject, "not checked", str(error))
-
-    result = episode.result
-    outcome = _outcome(played.success)
-    steps = len(played.success)
-    first = min(played.differences, default=None)
-    largest = max(played.differences.values(), default=0.0)
-    differs = f"the numbers differ since step {first} of {steps}, by at most {largest:.3g}"
-    if first is None:
-        differs = "all numbers are bit-identical"
-
-    texts = {
-        "ending": (played.ending, result.ending),
-        "instruction": (played.instruction, result.instruction),
-    }
-    for name, (replayed, recorded) in texts.items():
-        if replayed != recorded:
-            return Finding(
-                subject,
-                "differs",
-                f"its {name} is {replayed[:_LENGTH]!r} here, {recorded[:_LENGTH]!r} there",
-            )
-
-    if outcome != (result.success_once, result.success_at_end, result.first_success):
-        solved_here = "solved" if outcome[0] else "not solved"
-        solved_there = "solved" if result.success_once else "not solved"
-        return Finding(subject, "differs", f"{solved_here} here, {solved_there} there; {differs}")
-
-    detail = f"{steps} actions: all states, rewards and successes are bit-identical"
-    if first is not None:
-        detail = f"the same outcome, other numbers; {differs}"
-
-    differing = []
-    for name in sorted(case.described.keys() | played.described.keys()):
-        description = case.described.get(name)
-        description_here = played.described.get(name)
-        if description != description_here:
-            differing.append(
-                f"{name} {str(description_here)[:_LENGTH]}, there {str(description)[:_LENGTH]}"
-            )
-    if differing:
-        detail += f"; the environment describes itself here as: {'; '.join(differing)}"
-    return Finding(subject, "equal" if first is None else "other here", detail)
