@@ -5,18 +5,22 @@ and the new folder is usable like any other.
 from __future__ import annotations
 
 import base64
+import dataclasses
 import functools
 import itertools
 import json
 import os
 import sqlite3
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 from in_process_evaluation import play
 
 from vlagents_ray.errors import ConfigError
@@ -29,7 +33,7 @@ from vlagents_ray.evaluate.replay import find
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.combination import combined
 from vlagents_ray.evaluate.results.database import FILE
-from vlagents_ray.evaluate.results.reader import is_sequential
+from vlagents_ray.evaluate.results.reader import is_sequential, rate_of
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.interface import Obs
 from vlagents_ray_results.merge import merge
@@ -453,3 +457,116 @@ def test_a_folder_with_a_column_of_another_program_is_refused_and_nothing_is_wri
     with pytest.raises(ConfigError, match=r"got the unknown columns .*theirs"):
         merge(tmp_path / "merged", [folder])
     assert not (tmp_path / "merged").exists()
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A folder of results that one machine wrote, without a simulator."""
+
+    seeds: tuple[int, ...] = (0,)
+    episodes: int = 4
+    stop: float | None = None  # target of early stopping
+    suite: str = ""
+    execute: int | None = None
+    steps: tuple[int, ...] = ()
+    checkpoint: str | None = None
+    described: str | None = None
+    program: str | None = None
+    missing: frozenset[int] = frozenset()  # episodes without a result
+    lost: frozenset[int] = frozenset()  # episodes lost to infrastructure
+    other: frozenset[int] = frozenset()  # episodes with another outcome
+
+    def write(self, out: Path) -> Path:
+        """Write the folder `out`."""
+        stop = None if self.stop is None else {"target": self.stop, "at_least": 2}
+        policy: dict[str, Any] = {"name": "act", "execute": self.execute, "url": "http://a"}
+        if self.steps:
+            policy |= {"checkpoint": "run/{step}", "steps": list(self.steps)}
+        suite = {
+            "name": self.suite,
+            "envs": [LINE],
+            "episodes": self.episodes,
+            "seeds": list(self.seeds),
+        }
+        plan = {"policies": [policy], "suites": [suite], "stop": stop, "out": out}
+        with Store(resolve(EvalConfig.model_validate(plan))) as store:
+            store.begin_run({}, 0.0)
+            if self.checkpoint is not None:
+                store.note_policy("act", {"policy": "act", "checkpoint": self.checkpoint})
+            for job in plan_jobs(store.cases):
+                if self.described is not None:
+                    store.note_env(job.case.place, EnvInfo({"simulator": self.described}, {}))
+                number = job.key.seed
+                if number in self.missing:
+                    continue
+                solved = (number < 50) != (number in self.other)
+                result = EpisodeResult(job.key, "done", solved, solved, 1 if solved else None)
+                if number in self.lost:
+                    result = EpisodeResult(job.key, "infra_failed", error="lost")
+                store.record(result, attempts=1, finished=1.0)
+            store.end_run("complete")
+        if self.program is not None:
+            with closing(sqlite3.connect(out / "results.db")) as db, db:
+                db.execute("UPDATE cases SET program = ?", (self.program,))
+        return out
+
+
+_SOME = st.frozensets(st.sampled_from([0, 1, 2, 100, 101]), max_size=2)
+PARTS = st.builds(
+    Part,
+    seeds=st.sampled_from([(0,), (0,), (100,), (0, 100), (100, 0), (2,)]),
+    episodes=st.sampled_from([4, 4, 3]),
+    stop=st.sampled_from([None, None, 0.5, 0.6]),
+    suite=st.sampled_from(["", "", "lab"]),
+    execute=st.sampled_from([None, None, None, 2]),
+    steps=st.sampled_from([(), (), (), (10,)]),
+    checkpoint=st.sampled_from([None, None, "a", "b"]),
+    described=st.sampled_from([None, None, "1", "2"]),
+    program=st.sampled_from([None, None, None, "{}", '{"a.py": "1"}']),
+    missing=_SOME,
+    lost=st.one_of(st.just(frozenset()), _SOME),
+    other=st.one_of(st.just(frozenset()), st.just(frozenset()), _SOME),
+)
+
+
+def merged_in_order(folders: Sequence[Path], out: Path, *, accept_changes: bool) -> object:
+    """Return all that a merge counts; None if it is refused."""
+    try:
+        results = merge(out, folders, accept_changes=accept_changes).results
+    except ConfigError:
+        return None
+    cases = [
+        (
+            (case.policy_id, case.suite, case.env, case.case_id),
+            (case.planned, case.stopped_at, case.missing),
+            sorted((result.key.seed, result.success_once) for result in case.counted),
+            rate_of([case], "success_once"),
+        )
+        for case in results.cases
+    ]
+    totals = {name: rate_of(results.of(name), "success_once") for name in results.policy_ids}
+    return sorted(cases, key=str), totals
+
+
+@pytest.mark.slow
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(parts=st.lists(PARTS, min_size=2, max_size=3), accept_changes=st.booleans())
+# Both stopped early, at other seeds.
+@example(parts=[Part(stop=0.5), Part(seeds=(100,), stop=0.5)], accept_changes=False)
+# A suite has another name, and its name belongs to another suite.
+@example(parts=[Part(suite="lab"), Part(), Part(execute=2)], accept_changes=False)
+@example(parts=[Part(steps=(10,), checkpoint="a"), Part(checkpoint="b")], accept_changes=False)
+@example(parts=[Part(seeds=(100, 0)), Part(seeds=(0, 100))], accept_changes=False)
+def test_the_order_of_folders_changes_neither_a_rate_nor_whether_they_are_merged(
+    tmp_path: Path, parts: list[Part], accept_changes: bool
+) -> None:
+    with tempfile.TemporaryDirectory(dir=tmp_path) as temporary:
+        home = Path(temporary)
+        folders = [part.write(home / str(number)) for number, part in enumerate(parts)]
+        found = []
+        for number, order in enumerate(itertools.permutations(folders)):
+            out = home / f"merged-{number}"
+            found.append(merged_in_order(order, out, accept_changes=accept_changes))
+        assert all(one == found[0] for one in found), found

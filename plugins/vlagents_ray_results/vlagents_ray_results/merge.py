@@ -33,11 +33,14 @@ from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summ
 
 _SHOWN = 10  # maximum number of conflicts in a message
 Row = dict[str, Any]
+_Name = tuple[str, str, str, str]  # policy, step, suite and env of a case
 
 
 @dataclass(slots=True)
 class _Merged:
     """The tables of the merged results, by key; `home` is the folder of an episode's files."""
+
+    swept: set[str]  # policies with steps in any folder
 
     runs: list[Row] = field(default_factory=list)
     policies: dict[str, Row] = field(default_factory=dict)
@@ -46,6 +49,7 @@ class _Merged:
     attempts: list[Row] = field(default_factory=list)
     workers: list[Row] = field(default_factory=list)
     home: dict[str, Path] = field(default_factory=dict)
+    names: dict[_Name, Row] = field(default_factory=dict)  # a case of each name in any folder
 
 
 def merge(
@@ -54,7 +58,8 @@ def merge(
     """Merge the results of `folders` into the new folder `out`, which can be resumed.
 
     An episode with the same outcome in several folders is copied from the first folder; an episode
-    with an outcome replaces one that failed because of the infrastructure.
+    with an outcome replaces one that failed because of the infrastructure. Without `keep_first`,
+    the order of the folders changes neither a rate nor whether they can be merged.
 
     Args:
         out: A folder without results; it is created if it is missing.
@@ -67,7 +72,8 @@ def merge(
         The summary of the merged results.
 
     Raises:
-        ConfigError: Cases with the same name have different settings; a policy or the files of an
+        ConfigError: Cases with the same name have different settings; a case that can stop early
+            has different seeds or numbers of episodes; a policy or the files of an
             environment differ between folders and `accept_changes` is off; an episode has different
             outcomes and `keep_first` is off; or an episode's file is missing, or outside of its
             folder because of its path or a symbolic link.
@@ -80,7 +86,7 @@ def merge(
         )
     require_distinct(folders)
 
-    merged = _Merged()
+    merged = _Merged(_swept_policies(folders))
     conflicts: list[str] = []
     for folder in folders:
         with reading(folder) as db:
@@ -131,16 +137,24 @@ def merge(
     return summary
 
 
+def _swept_policies(folders: Sequence[Path]) -> set[str]:
+    """Return the policies with steps: their servers may have begun with any checkpoint."""
+    swept: set[str] = set()
+    for folder in folders:
+        with reading(folder) as db:
+            rows = db.execute("SELECT DISTINCT policy FROM cases WHERE step IS NOT NULL")
+            swept |= {name for (name,) in rows}
+    return swept
+
+
 def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
     """Add the policies of a folder; return the changes since the folders before it."""
     changes = []
-    swept_rows = db.execute("SELECT DISTINCT policy FROM cases WHERE step IS NOT NULL")
-    swept = {name for (name,) in swept_rows}
     for row in table(db, "policies"):
         known = merged.policies.setdefault(row["name"], row)
         before = json.loads(known["metadata"])
         now = json.loads(row["metadata"])
-        is_swept = row["name"] in swept
+        is_swept = row["name"] in merged.swept
         changes += policy_changes(f"policy {row['name']}", before, now, swept=is_swept)
         difference = changed(before, now, swept=is_swept)
         if difference in ("policy", "checkpoint"):
@@ -156,12 +170,10 @@ def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
 def _add_cases(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
     """Add the cases of a folder; return the changes since the folders before it."""
     changes: dict[Change, None] = {}
-    names = {_name(row): row for row in merged.cases.values()}
     for row in table(db, "cases"):
-        # A suite may have another name in this folder.
-        known = merged.cases.get(row["case_id"]) or names.setdefault(_name(row), row)
-        if known["case_id"] != row["case_id"]:
-            before = json.loads(known["settings"])
+        named = merged.names.setdefault(_name(row), row)
+        if named["case_id"] != row["case_id"]:
+            before = json.loads(named["settings"])
             differing = []
             for name, value in json.loads(row["settings"]).items():
                 if before.get(name) != value:
@@ -170,15 +182,13 @@ def _add_cases(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
                 f"{folder}: {' '.join(filter(None, _name(row)))} has other settings: "
                 f"{'; '.join(differing)}"
             )
-        if known is row:
+        if row["case_id"] not in merged.cases:
             merged.cases[row["case_id"]] = row
             continue
-        if known["stop"] != row["stop"]:
-            where = " ".join(filter(None, _name(row)))
-            raise ConfigError(
-                f"{folder}: {where} stops early by {row['stop']}, but by {known['stop']} in the "
-                f"folders before it"
-            )
+        known = merged.cases[row["case_id"]]
+        _require_same_stopping(known, row, folder)
+        # A suite may have another name in this folder; the choice is the same in any order.
+        known["suite"] = min(known["suite"], row["suite"])
 
         programs = []
         statements = []
@@ -200,18 +210,39 @@ def _add_cases(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
     return list(changes)
 
 
-def _name(case: Row) -> tuple[str, str, str, str]:
+def _require_same_stopping(known: Row, row: Row, folder: Path) -> None:
+    """Raise `ConfigError` if a case stops early by another rule than in the folders before, or in
+    another plan: which episodes count depends on their order in the plan.
+    """
+    where = " ".join(filter(None, _name(row)))
+    if known["stop"] != row["stop"]:
+        raise ConfigError(
+            f"{folder}: {where} stops early by {row['stop']}, but by {known['stop']} in the "
+            f"folders before it; merge them separately"
+        )
+    plans = [(json.loads(case["seeds"]), case["planned"]) for case in (known, row)]
+    if known["stop"] is not None and plans[0] != plans[1]:
+        (seeds, planned), (now_seeds, now_planned) = plans
+        raise ConfigError(
+            f"{folder}: {where} can stop early: expected {planned} episodes with the seeds "
+            f"{seeds}, as in the folders before it, got {now_planned} with {now_seeds}; merge them "
+            "separately, or evaluate without `stop`"
+        )
+
+
+def _name(case: Row) -> _Name:
     step = "" if case["step"] is None else f"step {case['step']}"
     return case["policy"], step, case["suite"], case["env"]
 
 
 def _extend(case: Row, other: Row, folder: Path) -> None:
-    """Plan the seeds of both cases, each with the larger number of episodes per seed."""
+    """Plan the seeds of both cases in ascending order, each with the larger number of episodes per
+    seed.
+    """
     seeds, added = json.loads(case["seeds"]), json.loads(other["seeds"])
     episodes = max(case["planned"] // len(seeds), other["planned"] // len(added))
-    seeds += [seed for seed in added if seed not in seeds]
-    ordered = sorted(seeds)
-    if any(high - low < episodes for low, high in itertools.pairwise(ordered)):
+    ordered = seeds if seeds == added else sorted({*seeds, *added})
+    if any(high - low < episodes for low, high in itertools.pairwise(sorted(ordered))):
         raise ConfigError(
             f"{folder}: {case['env']}: expected seeds {episodes} or more apart, as each has "
             f"{episodes} episodes, got {added}, together {ordered}, with which some episodes "
@@ -220,8 +251,8 @@ def _extend(case: Row, other: Row, folder: Path) -> None:
     # A folder that began after the first results of another one may have been added for them.
     planned_at = max(case["planned_at"], other["planned_at"])
     case |= {
-        "seeds": canonical(seeds),
-        "planned": episodes * len(seeds),
+        "seeds": canonical(ordered),
+        "planned": episodes * len(ordered),
         "planned_at": planned_at,
     }
 
