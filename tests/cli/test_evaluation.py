@@ -26,7 +26,7 @@ from vlagents_ray.cli.evaluation import forecasts, live_address, print_plan
 from vlagents_ray.cli.main import app
 from vlagents_ray.cli.policies import Served
 from vlagents_ray.envs.tabletop import Tabletop
-from vlagents_ray.errors import MissingDependency
+from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.evaluate import (
     EvalConfig,
     OutOfTime,
@@ -37,6 +37,7 @@ from vlagents_ray.evaluate import (
 )
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan import cases
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, require_installed, resolve
@@ -369,8 +370,36 @@ def test_a_time_that_leaves_out_some_cases_is_a_lower_bound(
     monkeypatch.setenv("COLUMNS", "150")
     url = "http://127.0.0.1:9"
     play(config(episodes=3, policy_url=url))
-    print_plan(config(envs=[LINE, OTHER_LINE], episodes=9, policy_url=url))
+    print_plan(config(envs=[LINE, OTHER_LINE], episodes=9, policy_url=url, resume=True))
     assert ": at least 0:00:0" in " ".join(capsys.readouterr().out.split())
+
+
+REFUSED = {
+    "no --resume": {"resume": False},
+    "fewer episodes": {"episodes": 2},
+    "other settings": {"execute": 2},
+    "another rule of early stopping": {"stop": {"target": 0.5}},
+    "other seeds": {"seed": 100},
+    "changed code": {},
+}
+
+
+@pytest.mark.parametrize("change", REFUSED)
+def test_a_dry_run_refuses_what_the_run_refuses_and_writes_nothing(
+    config: Callable[..., EvalConfig], monkeypatch: pytest.MonkeyPatch, change: str
+) -> None:
+    url = "http://127.0.0.1:9"
+    out = play(config(episodes=3, policy_url=url)).out
+    if change == "changed code":
+        monkeypatch.setattr(cases, "software", lambda: {"software: numpy": "version 0"})
+    planned = config(**{"episodes": 3, "policy_url": url, "resume": True, **REFUSED[change]})
+    before = (out / "results.db").read_bytes()
+    with pytest.raises(ConfigError) as of_dry_run:
+        print_plan(planned)
+    assert (out / "results.db").read_bytes() == before
+    with pytest.raises(ConfigError) as of_run:
+        play(planned)
+    assert str(of_dry_run.value) == str(of_run.value)
 
 
 class NeedsPackage(Tabletop):

@@ -44,9 +44,9 @@ from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.report.terminal import LineProgress
-from vlagents_ray.evaluate.results.database import FILE
+from vlagents_ray.evaluate.results.database import FILE, is_locked
 from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cases, summarize
-from vlagents_ray.evaluate.run import evaluate_plan
+from vlagents_ray.evaluate.run import check_results, evaluate_plan
 from vlagents_ray.policies.base.checkpoint import CHECKPOINT, STEP
 from vlagents_ray.ray_tools.private import node_of_this_process
 from vlagents_ray.registry import function_in_plugin, registered_class
@@ -458,14 +458,19 @@ def print_plan(config: EvalConfig, address: str | None = None) -> None:
         address: The Ray cluster, see `served`.
 
     Raises:
-        ConfigError: The evaluation could not run.
+        ConfigError: The evaluation could not run, or contradicts the results in its folder.
     """
     for tracker in config.track:
         registered_class("trackers", tracker)  # raises an error for an unknown name
 
     resolved, deployments = resolve_policies(config, ask=False)
     workers = planned_workers(config, deployments, address)
-    results = Results.load(resolved.out) if (resolved.out / FILE).is_file() else None
+    results = None
+    if (resolved.out / FILE).is_file():
+        # The plan of a run that has locked the folder was compared when the run began.
+        if not is_locked(resolved.out):
+            check_results(resolve(resolved))
+        results = Results.load(resolved.out)
     forecast = forecasts(plan_cases(resolved), results)
     out.print(_forecast_table(forecast))
     _print_sums(forecast, resolved.out, workers)

@@ -183,12 +183,13 @@ COLUMNS = (
     _of_episode(
         "env_program",
         "string",
-        "digest of the env's files, including its code; null for an installed env",
+        "digest of the software that runs the episode and of the env's files, including its code",
     ),
     _of_episode(
         "policy_program",
         "string",
-        "digest of the policy's files, including its code; null for an installed policy",
+        "digest of the software of the policy's server, its files and code, and the values of a "
+        "factory; null if its server reports none",
     ),
     _of_result(
         "ticks",

@@ -377,7 +377,9 @@ def _difference(there: EpisodeResult, here: EpisodeResult, recorded: int) -> str
     """Return the outcomes of an episode there and here; None if they are equal, and all `recorded`
     actions were executed.
     """
-    for name in ("success_once", "success_at_end", "first_success", "steps", "ending", "status"):
+    if here.status != "done":
+        return f"{_in_words(there)} there, here: {_cut(str(here.error))}"
+    for name in ("success_once", "success_at_end", "first_success", "steps", "ending"):
         if getattr(there, name) != getattr(here, name):
             return f"{_in_words(there)} there, {_in_words(here)} here"
     if here.steps != recorded:

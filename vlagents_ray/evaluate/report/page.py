@@ -330,7 +330,8 @@ class Configuration:
     runs: tuple[Run, ...]
     changes: list[Change]  # changes of files or weights between episodes
     plan_changes: list[Change]  # changes of the plan after the first results
-    programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files by path)
+    # (env, versions of its software and digests of its files at the last run)
+    programs: list[tuple[str, Mapping[str, str]]]
     # (policy id, checkpoint, commit, digest or version of the weights)
     checkpoints: list[tuple[str, str]]
     workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)

@@ -53,9 +53,11 @@ class Episode:
     attempts: int
     run: int
     finished: float  # seconds since 1970
-    # Digest of the environment's files; None for an installed environment.
+    # Digest of the software that runs the episode, and of the environment's files.
     env_program: str | None = None
-    policy_program: str | None = None  # digest of the policy's files; None for an installed policy
+    # Digest of the software of the policy's server, of the policy's files, and of the values of a
+    # factory; None if the server reports none.
+    policy_program: str | None = None
     # Whether the episode follows the end of its case, which stopped early, or is no longer planned.
     beyond: bool = False
     unplanned: bool = False  # whether the episode is no longer planned
@@ -125,7 +127,8 @@ class CaseResults:
     # Git state of the env's code, with `commit`, `dirty` and `diff_sha256`; {} if the code is not
     # in a git repository.
     code: dict[str, Any]
-    program: dict[str, str]  # digests of the env's files by their names; {} for an installed env
+    # Versions of software and digests of the env's files, by their names, at the last run.
+    program: dict[str, str]
     episodes: tuple[Episode, ...]  # in the order of the seeds
     attempts: tuple[Attempt, ...]
     stop: StopConfig | None = None  # the rule for stopping the case early

@@ -73,6 +73,8 @@ class Store(AbstractContextManager["Store"]):
             self._lock = lock(self.out)
 
         self._run = 0  # the number of this run
+        # Whether the folder has no results, except rows of a run that could not begin.
+        self._begins_anew = False
         self._changes: list[Change] = []  # the accepted changes of this run
         self._accepted: set[Hashable] = set()  # policies, cases and places with accepted changes
         self._policy_programs: dict[str, str | None] = {}  # metadata of each policy's server
@@ -107,6 +109,9 @@ class Store(AbstractContextManager["Store"]):
             canonical(versions),
         )
         with self._db:
+            if self._begins_anew:
+                for table in ("attempts", "cases", "policies", "workers", "runs"):
+                    self._db.execute(f"DELETE FROM {table}")  # noqa: S608 - one of these constants
             # Before the first row of this run, which changes what the plan is compared with.
             self._changes += self._growth()
             self._plan_cases(row[0])
@@ -450,8 +455,6 @@ class Store(AbstractContextManager["Store"]):
     def _require_resumable(self, db: sqlite3.Connection) -> None:
         """Raise `ConfigError` unless this plan may continue the results in the folder, if there are
         any.
-
-        Rows of an earlier plan whose run never began are deleted.
         """
         (runs,) = db.execute("SELECT COUNT(*) FROM runs").fetchone()
         (episodes,) = db.execute("SELECT COUNT(*) FROM episodes").fetchone()
@@ -465,10 +468,8 @@ class Store(AbstractContextManager["Store"]):
             )
 
         could_not_begin = not episodes and causes == {"user"}
-        if not runs or could_not_begin:
-            with db:
-                for table in ("attempts", "cases", "policies", "workers", "runs"):
-                    db.execute(f"DELETE FROM {table}")  # noqa: S608 - one of these constants
+        self._begins_anew = not runs or could_not_begin
+        if self._begins_anew:
             return
 
         if not self._plan.resume:
