@@ -381,7 +381,7 @@ def test_the_commands_print_the_rate_of_the_reproduced_episodes_and_end_with_1_i
     forged = {name: other_actions(tabletop / name)}
     code, said = run("verify", rewritten(file, tmp_path / "c.zip", forged, honest=True))
     assert code == 1
-    assert "policy tabletop 1 of 2 0% [0, 79] 0 to 50%" in said
+    assert "policy tabletop 1 of 2 0% [0, 91] 0 to 50%" in said
     assert "tabletop#0@0 policy not solved, truncated after 8 steps there, " in said
     assert "1 of 2 episodes reproduced" in said
 
