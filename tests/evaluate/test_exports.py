@@ -66,7 +66,7 @@ def test_no_text_of_a_table_is_a_formula_of_a_spreadsheet(
         for row in csv.DictReader(file):
             texts = [row[column.name] for column in COLUMNS if column.type in ("string", "json")]
             assert not [cell for cell in texts if cell.startswith(text[0])]
-            if row["suite"]:
+            if row["suite"] and row["status"] == "done":
                 assert row["instruction"] == f"'{text}"
 
 
