@@ -58,7 +58,23 @@ SUBJECTS = {
     ),
     "sessions": Subject(
         ("vlagents_ray/serve/sessions.py", "vlagents_ray/serve/scaling/session_migration.py"),
-        ("tests/serve/test_sessions.py", "tests/serve/scaling", "tests/serve/engine"),
+        (
+            "tests/serve/test_sessions.py",
+            "tests/serve/scaling",
+            "tests/serve/engine",
+            "tests/serve/test_not_executed.py",
+        ),
+    ),
+    "models": Subject(
+        ("vlagents_ray/serve/models/*.py",),
+        (
+            "tests/serve/models",
+            "tests/serve/engine",
+            "tests/serve/weights",
+            "tests/serve/python_env",
+            "tests/serve/queue/test_call_limits.py",
+            "tests/serve/test_loading.py",
+        ),
     ),
     "engine": Subject(
         ("vlagents_ray/serve/engine/*.py",),

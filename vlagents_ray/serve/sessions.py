@@ -156,7 +156,7 @@ class Session(Generic[M]):
         """Raise an error unless an act can be executed in the session's current episode."""
         if self.agent is None:
             raise NotReset(f"session {self.id!r}: its last reset failed; reset again")
-        if not self.has_episode_of(pending):
+        if not pending.belongs_to(self.first, self.steps, self.began):
             step = pending.request.step
             raise self.wrong_episode() if step is None else self.wrong_step(step)
 
@@ -300,11 +300,9 @@ class SessionTable(Generic[M]):
         )
 
     def episode_of(self, session_id: str, origin: Origin) -> int | None:
-        """Return the first step of the episode in which a connection uses the session: that of its
-        waiting reset, or of its last executed request; None if there is none.
+        """Return the first step of the episode in which the connection of `origin` uses a session:
+        that of its waiting reset, or of its last executed request; None if there is none.
         """
-        if not origin.owner:
-            return None
         for opening in reversed(self._openings.get(session_id, ())):
             if opening.origin is origin:
                 return opening.first
@@ -377,10 +375,11 @@ class SessionTable(Generic[M]):
             ConnectionLost: The connection of the request has ended.
         """
         session.used = time.monotonic()
-        if session.origin is origin and origin.sessions.get(session.id) == session.first:
-            return  # this is nearly always the case, and avoids taking the lock
-        with self._lock:
-            self._own(session, origin, session.first)
+        if not origin.owner:
+            session.origin = origin  # there is no connection whose end could end the session
+        elif session.origin is not origin or origin.sessions.get(session.id) != session.first:
+            with self._lock:
+                self._own(session, origin, session.first)
 
     def _own(self, session: Session[M], origin: Origin, first: int) -> None:
         """Let the session belong to the connection of `origin`, in the episode that begins at the

@@ -91,7 +91,8 @@ class Intake:
                     info = self._execute(pending)
                     pending.finish(Reply(pending.request.request_id, info=info))
                     continue
-                pending.episode = self._sessions.episode_of(pending.session_id, pending.origin)
+                if pending.origin.owner:
+                    pending.episode = self._sessions.episode_of(pending.session_id, pending.origin)
                 reserved = pending.reserved = self.reserve(pending)
                 if reserved is None and pending.request.op in BACKGROUND_OPS:
                     self._background.submit(pending)
