@@ -140,6 +140,11 @@ class World:
         info = {SLACK: 500.0, TICKS: (5, 1), EXECUTED_AGE: 30.0}
         self.begin(self.robot, Request("act", obs(**info), session=ARM))()
 
+    def close(self) -> None:
+        """Close the engine."""
+        Counts.gate.set()
+        self.engine.close()
+
     def snapshot(self) -> dict[str, Any]:
         """Return the state of all sessions, and of the table."""
         table = self.engine.sessions
@@ -166,7 +171,6 @@ class World:
             "versions": table.versions(),
             "connections": dict(table.movable_by_connection(1e9)),
             "number": (len(table), table.opened),
-            "in flight": self.engine.admission.held,
             "waiting": self.engine.queue.depth(),
             "present": [
                 plan.is_present(self.clock.now, waits=waits) for plan, waits in self.engine._plans()
@@ -286,6 +290,7 @@ def client_of(world: World, way: str) -> Iterator[Client]:
                 client = ServerStreamClient(stack.enter_context(socket))
         else:
             client = EngineClient(world, connected=way == "engine")
+        stack.callback(world.close)  # before its endpoints, as a replica does
         stack.callback(client.end)
         yield client
 
@@ -418,12 +423,11 @@ def play(
                 intruder.send(request)
                 intruder.receive()
 
-        wait_for(lambda: world.engine.admission.held == 0)
         states.append(world.snapshot())
         if comes:
             intruder.end()
         world.ask(world.other, "act", OTHER)  # a barrier, after which the end has been read
-        wait_for(lambda: world.engine.queue.depth() == world.engine.admission.held == 0)
+        wait_for(lambda: world.engine.queue.depth() == 0)
         states.append(world.snapshot())
 
         world.act_with_report()
@@ -437,7 +441,8 @@ def play(
         states.append(world.snapshot())
         world.robot.release()
         states.append(world.snapshot())
-    world.engine.close()
+        # Messages are released after their answers, on other threads.
+        wait_for(lambda: world.engine.admission.held == 0)
     return world.answers, states
 
 
