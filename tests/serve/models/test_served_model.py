@@ -9,19 +9,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from asgi_server import served
 from eval_fakes import wait_for
 from in_process_replicas import export
 from numbered_checkpoints import Library, act, ask, begin, reset
 
-from vlagents_ray import Act, Agent
+from vlagents_ray import Act, Agent, Obs, RemoteAgent
 from vlagents_ray.errors import (
     InvalidObservation,
+    NoReplica,
     PolicyFailed,
     PolicyUnavailable,
     UnknownSession,
 )
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.checkpoint_files import digest
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.loaded_model import PolicySource
@@ -74,6 +79,26 @@ class Swapping:
         assert not self._thread.is_alive()
         if self.error is not None:
             raise self.error
+
+
+@pytest.mark.parametrize("transport", ["http", "websocket"])
+def test_a_client_that_begins_an_episode_during_a_swap_waits_for_its_end(
+    serving: Callable[..., Engine], library: Library, transport: str
+) -> None:
+    engine = serving()
+    gate = library.hold("b/2")
+    about = {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION}
+    app = AccessMiddleware(build_http_app(engine, lambda: about, DEFAULT_LIMITS), None, "app")
+    url = "http://127.0.0.1"
+    with served(app) as port, RemoteAgent(f"{url}:{port}", transport=transport) as agent:
+        agent.reset(Obs(), "x")
+        before = agent.act(Obs()).action
+        swapping = Swapping(engine, "b/2")
+        library.wait_for("b/2")
+        threading.Timer(1.5, gate.set).start()
+        agent.reset(Obs(), "x")
+        assert not np.array_equal(agent.act(Obs()).action, before)
+        swapping.end()
 
 
 def test_a_swap_closes_the_old_model_before_it_loads_the_next_one(
@@ -145,7 +170,7 @@ def test_the_running_batch_ends_on_the_old_model(
     assert reply.act.action[0] == 1
     # No request reaches a model for which it was not sent.
     errors = [type(replies.get(timeout=10).error) for replies in waiting]
-    assert set(errors) <= {PolicyUnavailable, UnknownSession, type(None)}
+    assert set(errors) <= {NoReplica, UnknownSession, type(None)}
     assert library.loads == {"a/1": 1, "b/2": 1}
     assert [name for name, _ in library.batches if name == "b/2"] == []
 

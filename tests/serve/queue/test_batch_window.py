@@ -322,3 +322,17 @@ def test_a_batch_with_another_operation_than_acts_does_not_count_for_the_duratio
         returning.record_start([ticket("a", 11.0), ticket("b", 11.0)])
         returning.record_end(11.0, 0.1)
     assert returning.describe_costs() == before
+
+
+@pytest.mark.parametrize("sizes", [[16], [4, 16], [2, 3, 16], [1, 16]])
+def test_batches_smaller_than_all_that_ran_are_not_taken_for_slower(sizes: list[int]) -> None:
+    cost = BatchCost()
+    for size in sizes:
+        assert cost.add(size, 0.02 + 0.01 * size)
+        assert not cost.add(size, 0.02 + 0.01 * size)
+    curve = cost.curve(16)
+    assert curve is not None
+    assert curve.cost_s(16) == pytest.approx(0.18)
+    expected = 0.18 / 16 if len(sizes) == 1 else 0.03
+    assert curve.cost_s(1) == pytest.approx(expected)
+    assert len(curve.table) == len({1, *sizes})

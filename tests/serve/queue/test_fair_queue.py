@@ -296,6 +296,23 @@ def test_a_batch_is_filled_up_to_the_room_that_robots_leave(
     assert len(batch) == expected
 
 
+@pytest.mark.parametrize("rows", range(1, 5))
+@pytest.mark.parametrize("priority", list(Priority))
+def test_no_other_row_makes_a_robot_late_that_is_otherwise_in_time(
+    rows: int, priority: Priority
+) -> None:
+    waiting = FairQueue()
+    waiting.costs_s = (0.0, 0.1, 0.2, 0.3, 0.4)
+    robot = ticket("robot", priority=Priority.ROBOT)
+    robot.needed = waiting.costs_s[rows] + 0.05
+    waiting.add(robot)
+    for number in range(4):
+        other = ticket(f"other{number}", priority=priority)
+        other.needed = 9.0 if priority is Priority.ROBOT else 0.0
+        waiting.add(other)
+    assert len(taken(waiting, 4)) == rows
+
+
 def test_a_held_request_is_added_to_a_batch_of_robots_now_and_then() -> None:
     waiting = FairQueue()
     waiting.costs_s = (0.0, 0.05, 0.06, 0.07, 0.08)

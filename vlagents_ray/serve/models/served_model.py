@@ -16,7 +16,7 @@ from typing import Any
 
 from vlagents_ray.abilities import ChecksHealth, ability
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.errors import NoReplica
 from vlagents_ray.policies.base.accelerator import free_memory, gpu_memory
 from vlagents_ray.policies.base.checkpoint import checkpoint_name
 from vlagents_ray.policies.base.program import Program
@@ -108,19 +108,17 @@ class ServedModel:
         return self._loaded
 
     def require_loaded(self) -> LoadedModel:
-        """Return the loaded model; raise `PolicyUnavailable` if there is none."""
+        """Return the loaded model; raise `NoReplica` if there is none."""
         model = self._loaded
         if model is None:
             raise self.loading()
         return model
 
-    def loading(self) -> PolicyUnavailable:
+    def loading(self) -> NoReplica:
         """Return the error for clients while a model is loaded. The error contains the current step
         of loading.
         """
-        return PolicyUnavailable(
-            f"the policy is loading{self.step and f' ({self.step})'}; try again"
-        )
+        return NoReplica(f"the policy is loading{self.step and f' ({self.step})'}; try again")
 
     def check_health(self) -> None:
         """Raise the error of the agent's own health check."""
@@ -146,7 +144,7 @@ class ServedModel:
 
     @property
     def own_weights(self) -> ModelWeights:
-        """Versions of the model's weights; raises `PolicyUnavailable` if there is no model."""
+        """Versions of the model's weights; raises `NoReplica` if there is no model."""
         return self.require_loaded().parameters
 
     @property
