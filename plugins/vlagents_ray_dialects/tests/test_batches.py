@@ -7,9 +7,11 @@ sessions at the same step.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Coroutine, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +30,14 @@ from in_process_replicas import Replicas
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.errors import InvalidObservation, PolicyFailed
-from vlagents_ray.protocol.messages import Budget
+from vlagents_ray.protocol.messages import Budget, Reply
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.access.charges import free
+from vlagents_ray.serve.dialects import base
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.settings import EngineSettings
+from vlagents_ray.serve.requests import IncomingMessage
 from vlagents_ray_dialects.messages import openpi
 from vlagents_ray_dialects.messages import xpolicylab as xpolicylab_codec
 
@@ -286,3 +295,59 @@ def test_all_names_of_a_batch_are_searched_for_at_once() -> None:
         assert len(searches) == 8
     finally:
         replicas.close()
+
+
+class Waiting(Agent):
+    """A policy that counts its acts, and waits for `opened` at an observation that asks for it."""
+
+    opened, entered = threading.Event(), threading.Event()
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, Any]:
+        self.acts = 0
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        if "wait" in obs.info:
+            self.entered.set()
+            assert self.opened.wait(60)
+        self.acts += 1
+        return Act(np.full((1, 1), self.acts, np.float32))
+
+
+@pytest.mark.parametrize("before", [0, 2], ids=["new sessions", "running sessions"])
+@pytest.mark.parametrize("waiting", range(ROBOTS))
+def test_a_batch_whose_client_leaves_leaves_the_sessions_alike(waiting: int, before: int) -> None:
+    engine = Engine(Waiting(), EngineSettings())
+    engine.start()
+    sender = Sender(engine, "test", "a", caller=NoKey.OPEN, has_left=None, connected=False)
+    group = [base.ImplicitSession(engine, sender, "robot", name) for name in ("a", "b", "c")]
+
+    def act(waits: int | None = None) -> Coroutine[Any, Any, list[Reply]]:
+        observations = []
+        for index, session in enumerate(group):
+            info = {"wait": True} if index == waits else {}
+            obs = Obs(state={"joints": np.zeros(2, np.float32)}, info=info)
+            observations.append(base.SessionObs(session, obs, None))
+        message = IncomingMessage("test", "act", "robot", free(NoKey.OPEN))
+        return base.act_together(message, observations, "r")
+
+    async def run() -> None:
+        for _ in range(before):
+            await act()
+        held = engine.sessions.ids()
+        Waiting.opened.clear()
+        Waiting.entered.clear()
+        leaving = asyncio.ensure_future(act(waiting))
+        await asyncio.to_thread(Waiting.entered.wait, 60)
+        leaving.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await leaving
+        assert engine.sessions.ids() == held
+        Waiting.opened.set()
+
+        replies = await act()
+        acts = [float(reply.act.action[0, 0]) for reply in replies if reply.act is not None]
+        assert acts == [1.0] * ROBOTS
+
+    asyncio.run(run())
+    engine.close()
