@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -19,6 +20,7 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.protocol.messages import Priority, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.queue import batch_queue
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.fair_queue import BEHIND_OTHERS_S, PATIENCE_S, FairQueue
 from vlagents_ray.serve.queue.robots_load import IDLE, Room
@@ -238,6 +240,28 @@ def test_the_time_spent_waiting_for_requests_counts_as_idle() -> None:
     quiet.poller.close()
 
 
+def test_held_requests_wait_for_a_robot_and_the_queue_counts_as_busy(
+    queue: Callable[[int], BatchQueue], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batch_queue, "_HELD_S", 0.05)
+    waiting = queue(4)
+    waiting.room = Room(4, 0, 0, 5.0, IDLE)
+    simulation = ticket("env")
+    waiting.put(simulation)
+    idle_s = waiting.load_s()[0]
+    assert waiting.next() == ([], []), "the needs of robots are read again"
+    assert waiting.load_s()[0] == idle_s, "more replicas are needed"
+
+    waiting._waiting._held_until = math.inf
+    robot = urgent("robot", arrived=time.perf_counter())
+    timer = threading.Timer(0.02, waiting.put, [robot])
+    timer.start()
+    assert waiting.next() == ([robot], [])
+    timer.join()
+    waiting.room = None
+    assert waiting.next() == ([simulation], [])
+
+
 def behind(session: str, *, arrived: float = 0.0) -> PendingRequest:
     """Return the request of a robot that is about to run out of rows, but waits behind others."""
     request = ticket(session, priority=Priority.ROBOT, arrived=arrived)
@@ -251,6 +275,17 @@ def urgent(session: str, *, arrived: float = 0.0) -> PendingRequest:
     request = ticket(session, priority=Priority.ROBOT, arrived=arrived)
     request.needed = arrived + 1e-3
     return request
+
+
+def test_a_lone_request_gives_the_next_impatient_simulation_its_slot() -> None:
+    waiting = filled(ticket("env0"), ticket("robot0", priority=Priority.ROBOT))
+    now = 2 * PATIENCE_S
+    assert taken(waiting, 2, now) == ["env0", "robot0"]
+    waiting.add(ticket("lone", priority=Priority.ROBOT, arrived=now))
+    assert taken(waiting, 1, now) == ["lone"]
+    waiting.add(ticket("env1"))
+    waiting.add(ticket("robot1", priority=Priority.ROBOT, arrived=now))
+    assert taken(waiting, 1, now) == ["env1"]
 
 
 def test_robots_of_the_newest_episodes_wait_behind_all_others() -> None:

@@ -162,6 +162,25 @@ def test_a_robot_whose_rate_is_unknown_waits_until_the_others_are_answered() -> 
     assert robots.pace.replan_s(plan) == pytest.approx(10 * PI0.cost_s(16))
 
 
+def test_two_robots_whose_rates_are_unknown_keep_their_distance() -> None:
+    first, second = RobotPlan(), RobotPlan()
+    robots = Robots(first, second)
+    for plan in robots.plans:
+        plan.observe(50, arrived=robots.now - 0.5, needed=robots.now, now=robots.now)
+    assert robots.pace.replan_s(second) == pytest.approx(0.5)
+
+
+def test_two_robots_whose_rates_are_known_have_a_pace() -> None:
+    robots = Robots(*plans(OF_50, 2))
+    plan = robots.plans[0]
+    for needed_s in (0.0, 1.0):
+        plan.observe(50, robots.now, robots.now + needed_s, robots.now + 0.1)
+    assert robots.pace.replan_s(plan) > 0.0
+    del robots.plans[1]
+    robots.read()
+    assert robots.pace.replan_s(plan) == 0.0
+
+
 def test_the_rate_of_a_robot_is_that_of_its_rows_although_it_held_still() -> None:
     plan = RobotPlan()
     plan.observe(50, arrived=10.0, needed=10.0, now=14.0)
