@@ -272,7 +272,9 @@ def test_roboarena_is_told_what_the_contract_declares(
 
     Declared.contract = contract
     with serving(Declared(), {"roboarena": {}}) as (client, _):
-        DialectArgs(roboarena={}).require_fit(contract)  # type: ignore[arg-type]
+        args = DialectArgs(roboarena={})  # type: ignore[arg-type]
+        args.require_fit(contract)
+        DialectArgs(**args.model_dump()).require_fit(contract)  # as a replica receives it
         with client.websocket_connect("/roboarena") as socket:
             first = openpi.decode(socket.receive_bytes())
     assert {name: first[name] for name in expected} == expected

@@ -188,18 +188,19 @@ class RoboArenaDialectConfig(DialectConfig):
     """
 
     mapping: MappingSetting = "roboarena"
-    image_resolution: tuple[int, int] | None = Field(
-        default=(224, 224), description="height, width; null: any; default: the contract's"
+    image_resolution: tuple[int, int] | Literal["any"] | None = Field(
+        default=None, description="height, width; default: the contract's, or 224, 224"
     )
-    needs_wrist_camera: bool = Field(
-        default=True,
-        description="whether the client sends the wrist camera; default: the contract's",
+    needs_wrist_camera: bool | None = Field(
+        default=None,
+        description="whether the client sends the wrist camera; default: the contract's, or true",
     )
-    n_external_cameras: int = Field(
-        default=1,
+    n_external_cameras: int | None = Field(
+        default=None,
         ge=0,
         le=2,
-        description="number of external cameras that the client sends; default: the contract's",
+        description="number of external cameras that the client sends; default: the contract's, "
+        "or 1",
     )
     needs_stereo_camera: bool = Field(
         default=False, description="whether the client sends both images of stereo cameras"
@@ -229,6 +230,14 @@ _ACTION_SPACES = {
 }
 
 
+# The fields of a policy that takes any cameras; these are RoboArena's own defaults.
+_DEFAULTS = {
+    "image_resolution": [224, 224],
+    "needs_wrist_camera": True,
+    "n_external_cameras": 1,
+}
+
+
 def _announcement(
     config: RoboArenaDialectConfig, contract: Contract | None
 ) -> tuple[dict[str, Any], list[str]]:
@@ -238,12 +247,17 @@ def _announcement(
     announced = config.model_dump(mode="json", exclude={"mapping", "priority", "bare"})
     declared, faults = _declared(config, contract)
     for name, value in declared.items():
-        if name in config.model_fields_set and announced[name] not in (value, None):
+        if announced[name] not in (value, None):
             faults.append(
                 f"{name}: expected {value}, as the policy's contract declares, got "
                 f"{announced[name]}; leave the setting out"
             )
         announced[name] = value
+    for name, value in _DEFAULTS.items():
+        if announced[name] is None:
+            announced[name] = value
+    if announced["image_resolution"] == "any":
+        announced["image_resolution"] = None  # as RoboArena's protocol has it
     if announced["action_space"] is None and not faults:
         faults.append(
             "action_space: expected the meaning of the actions, since the policy's contract does "
