@@ -330,3 +330,57 @@ def test_an_episode_is_that_of_the_connections_own_waiting_reset_until_it_is_dro
     assert table.episode_of("a", left) == begun
     assert table.episode_of("a", right) == waiting[1].first
     assert table.get("a").first == begun
+
+
+def test_an_episode_that_began_later_is_kept_at_a_smaller_step_and_the_earlier_one_is_void() -> (
+    None
+):
+    here: SessionTable[object] = SessionTable(limit=10, idle_s=60)
+    here.enter(Session("a", steps=9, first=9, began=7.0))
+    assert here.drop_older({"a": Past((10, 0), 5.0)}) == {"a": Past((9, 0), 7.0)}
+    assert "a" in here
+
+    there: SessionTable[object] = SessionTable(limit=10, idle_s=60)
+    there.enter(Session("a", steps=10, first=10, began=5.0))
+    there.void("a", 8, (9, 0))
+    assert "a" in there, "another episode"
+    there.void("a", 10, (9, 0))
+    assert "a" not in there
+    with pytest.raises(Outdated):
+        there.enter(Session("a", steps=8))
+    there.enter(Session("a", steps=9, moves=1))
+
+
+def test_a_step_is_raised_above_the_greater_step_of_an_earlier_episode() -> None:
+    table: SessionTable[object] = SessionTable(limit=10, idle_s=60)
+    origin = Origin(owner="left")
+    session = opened(table, "a", origin)
+    first = session.first
+    session.advance()
+
+    assert table.raise_step("a", first - 1, first + 5) is None, "another episode"
+    raised = table.raise_step("a", first, first + 5)
+    assert raised is not None
+    assert raised > first + 5
+    assert (session.first, session.steps) == (raised, raised + 1)
+    assert origin.sessions == {"a": raised}
+
+
+def test_a_waiting_reset_with_a_greater_step_is_reported_if_it_arrived_earlier() -> None:
+    table: SessionTable[object] = SessionTable(limit=10, idle_s=60)
+    reset = pending("a", Request("reset"))
+    opening = table.reserve(reset, {}, follows=True)
+    step = opening.first - 10
+    assert table.drop_older({"a": Past((step, 0), reset.arrived - 1)}) == {}
+    greater = table.drop_older({"a": Past((step, 0), reset.arrived + 1)})
+    assert greater == {"a": Past((opening.first, 0), reset.arrived)}
+
+
+def test_a_connection_has_no_session_after_its_close() -> None:
+    table: SessionTable[object] = SessionTable(limit=10, idle_s=60)
+    origin = Origin(owner="left")
+    opened(table, "a", origin)
+    close = pending("a", Request("close"), origin=origin)
+    close.episode = table.episode_of("a", origin)
+    table.close_for(close)
+    assert (len(table), origin.sessions) == (0, {})
