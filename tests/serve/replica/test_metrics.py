@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from in_flight import opened
 
 from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.policies.noop import Noop
@@ -105,7 +106,7 @@ def test_the_sessions_of_all_transports_are_exported(monkeypatch: pytest.MonkeyP
     engine.start()
     exporter = Exporter(engine, {})
     for number, transport in enumerate(["sglang", "sglang", "xpolicylab", "shm", "of somebody"]):
-        engine.sessions.open(str(number), Origin(transport))
+        opened(engine.sessions, str(number), Origin(transport))
         exporter.export()
         assert sum(exported.values()) == len(engine.sessions) == number + 1
     assert exported["sglang"] == 2
