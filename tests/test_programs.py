@@ -9,7 +9,10 @@ from pathlib import Path
 
 import programs
 import pytest
+import verified
 from programs import PROGRAMS
+
+from vlagents_ray.registry import names
 
 
 def test_what_is_noted_is_of_programs_that_there_are_in_the_versions_that_are_wanted_and_passed() -> (
@@ -54,6 +57,37 @@ def test_outcomes_are_noted_by_program_and_python_beside_those_of_others(
             "3.12": {"versions": "provael 0.46.0, openpi-client 0.1.2", "passed": 1, "failed": 1}
         },
     }
+
+
+CLIENTS_OF = {
+    "gr00t": "GR00T",
+    "lerobot": "LeRobot",
+    "lerobot_remote": "LeRobot",
+    "openpi": "openpi",
+    "openvla": "OpenVLA",
+    "roboarena": "RoboArena",
+    "sglang": "SGLang",
+    "vla_eval": "vla-eval",
+    "vlagents": "vlagents",
+    "xpolicylab": "XPolicyLab",
+}
+
+
+def test_each_dialect_is_named_where_its_users_look() -> None:
+    assert sorted(CLIENTS_OF) == sorted(names("dialects"))
+    readme, page, listed = (
+        (verified.ROOT / name).read_text()
+        for name in ("README.md", "docs/other_clients.md", "docs/programs.md")
+    )
+    clients = readme.partition("Your client still works")[2].partition("connect unchanged")[0]
+    for client in CLIENTS_OF.values():
+        assert client in clients
+        assert client in page
+    # What has a test of its own needs no other dialect.
+    missing = listed.partition("## Programs that need another dialect")[2].lower()
+    for program in PROGRAMS.values():
+        version = programs.versions(program).partition(",")[0] if program.client else "none"
+        assert f"| {version} |" not in missing
 
 
 def test_each_program_is_run_by_a_test() -> None:

@@ -136,6 +136,21 @@ def unitree_g1(port: int) -> Said:
     return said(executed, ["ego_view"], left_arm=state[:7], right_arm=state[8:15], **legs)
 
 
+def xpolicylab(port: int) -> Said:
+    from inspect_robots_xpolicylab.policy import XPolicyLabPolicy
+
+    policy = XPolicyLabPolicy(
+        url=f"ws://127.0.0.1:{port}/xpolicylab",
+        arms=2,
+        arm_dim=6,
+        cameras={"cam_head": "base"},
+        camera_height=64,
+        camera_width=64,
+        required_state_keys=(),
+    )
+    return said(_inspect_robots(policy), ["front"])
+
+
 # Other programs
 
 

@@ -195,6 +195,15 @@ PROGRAMS = {
         requirements=_adapter("unitree-g1", "0.1.1", "msgpack", "msgpack-numpy", "pyzmq"),
         dialects={"gr00t": {"mapping": {"preset": "gr00t", "action": _G1}}},
     ),
+    "inspect-robots-xpolicylab": Program(
+        ("inspect-robots-xpolicylab", "inspect-robots"),
+        "xpolicylab",
+        client="xpolicylab",
+        dim=14,
+        said="its `url` ends in `/xpolicylab`",
+        requirements=_adapter("xpolicylab", "0.1.0"),
+        dialects={"xpolicylab": {}},
+    ),
     "strands-robots Cosmos 3": Program(
         ("strands-robots",),
         "openpi",
