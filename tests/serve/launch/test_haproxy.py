@@ -106,6 +106,7 @@ def started(folder: Path, settings: str) -> Iterator[str]:
         address = f"127.0.0.1:{silent.getsockname()[1]}"
         common = (
             f"global\n    maxconn {MOST_CONNECTIONS}\n"
+            f"    stats socket {folder / 'admin'} level admin\n"
             "defaults\n    mode http\n"
             "    timeout connect 60s\n    timeout client 60s\n    timeout server 60s\n"
             "frontend http_frontend\n    bind 127.0.0.1:PORT\n"
@@ -198,6 +199,32 @@ def test_clients_are_refused_until_the_first_replica_runs_and_when_the_server_st
     close_port()  # the server stops
     assert set(binds(launcher, config, REPLICA)) == set(own)
     assert set(binds(launcher, config, FALLBACK)) == set(own)
+
+
+@needs_haproxy
+def test_the_port_of_a_stopping_server_is_closed_at_once_and_open_connections_get_503(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The replica is down, and Serve's own proxy would answer that it knows no such path."""
+    monkeypatch.setenv(MARK, str(tmp_path))
+    with toggled("Serve's proxy") as (fallback, up):
+        up.set()
+        servers = (f"{REPLICA} disabled", f"SERVE_PROXY_ACTOR-f 127.0.0.1:{fallback} backup")
+        with proxied(tmp_path, *servers) as url:
+            kept = HTTPConnection(url.removeprefix("http://"), timeout=30)
+            kept.request("GET", "/act")
+            with kept.getresponse() as before:
+                assert before.status == 200
+                before.read()
+            close_port()
+
+            kept.request("GET", "/act")
+            with kept.getresponse() as after:
+                assert after.status == 503
+                kind = after.headers["content-type"]
+                assert isinstance(refusal(503, kind, after.read()), NoReplica)
+            kept.close()
+            assert not listens(int(url.rpartition(":")[2]))
 
 
 def test_a_cluster_whose_haproxy_serves_others_opens_its_port_at_once(tmp_path: Path) -> None:
@@ -344,11 +371,14 @@ def toggled(name: str) -> Iterator[tuple[int, threading.Event]]:
     up, over = threading.Event(), threading.Event()
 
     class Named(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
         def do_GET(self) -> None:
             while not up.is_set() and not over.is_set():
                 up.wait(0.1)
             with suppress(OSError):  # the client may have left in the meantime
                 self.send_response(200)
+                self.send_header("content-length", str(len(name)))
                 self.end_headers()
                 self.wfile.write(name.encode())
 

@@ -7,12 +7,15 @@ the script that starts HAProxy on a cluster.
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import functools
 import json
 import os
 import resource
 import shlex
 import shutil
+import socket
 import ssl
 import sys
 import time
@@ -37,6 +40,10 @@ _RETRY_AFTER_S = 1
 _OPEN = "open"  # file in the launcher's folder that marks a port as open; it then stays open
 # File there that marks the port of a stopping server as closed to new connections.
 _CLOSED = "closed"
+_ADMIN = "admin"  # HAProxy's socket for commands, in the launcher's folder
+_ADMIN_S = 2.0  # time limit of a command
+_LISTENERS = ("http_frontend", "outside")  # those for clients, of which the second may not exist
+_FALLBACK = "SERVE_PROXY_ACTOR"  # beginning of the name of Serve's own proxy in a backend
 # File in the launcher's folder with the response of a server without replicas.
 _REFUSAL = "no-replica.http"
 _CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # for TLS 1.2: with forward secrecy, without CBC
@@ -247,7 +254,7 @@ def ingress_environment(
         "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "metrics"),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
         # Short, since the length of a socket's path is limited.
-        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin"),
+        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / _ADMIN),
         "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
         "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "server-state"),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
@@ -385,12 +392,35 @@ def open_port(folder: Path) -> None:
 
 
 def close_port() -> None:
-    """Close the port of this process's server to new connections, at HAProxy's next update. Clients
-    of other systems retry a refused connection, but give up after a rejected handshake.
+    """Close the port of this process's server to new connections, now and in each later HAProxy.
+    Clients of other systems retry a refused connection, but give up after a rejected handshake.
+
+    Open connections stay. Once the replicas have ended, their requests are answered with 503:
+    without Serve's own proxy, which would answer that it knows no such path.
     """
     folder = os.environ.get(MARK)
-    if folder:
-        (Path(folder) / _CLOSED).touch()
+    if not folder:
+        return
+    (Path(folder) / _CLOSED).touch()
+    admin = Path(folder) / _ADMIN
+    with contextlib.suppress(OSError):  # HAProxy has ended
+        for name in _LISTENERS:
+            _command(admin, f"disable frontend {name}")
+        # A line begins with the id and the name of the backend, and those of the server.
+        for line in _command(admin, "show servers state").splitlines():
+            fields = line.split()
+            if len(fields) > 3 and fields[3].startswith(_FALLBACK):
+                _command(admin, f"disable server {fields[1]}/{fields[3]}")
+
+
+def _command(admin: Path, command: str) -> str:
+    """Return HAProxy's answer to a command at its socket."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(_ADMIN_S)
+        connection.connect(str(admin))
+        connection.sendall(f"{command}\n".encode())
+        pieces = iter(functools.partial(connection.recv, 65536), b"")
+        return b"".join(pieces).decode(errors="replace")
 
 
 def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadline: float) -> None:
