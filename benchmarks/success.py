@@ -239,7 +239,7 @@ class Players:
             ports = {name: free_port() for name in ("gr00t", "vlagents")}
             dialects = {
                 "openpi": {"mapping": _KEYS},
-                "roboarena": {"mapping": _KEYS, "n_external_cameras": 0},
+                "roboarena": {"mapping": _KEYS, "action_space": "cartesian_position"},
                 "openvla": {"mapping": _KEYS, "chunk": True},
                 "vla_eval": {"mapping": _VLA_EVAL, "execute": EXECUTE},
                 "gr00t": {"mapping": _GR00T, "port": ports["gr00t"]},

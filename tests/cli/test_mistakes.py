@@ -226,7 +226,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "an anchor in itself": (
         ["eval", "policies: &a [*a]\n"],
-        ["policies.0: expected a mapping", "got list"],
+        ["not YAML", "names a value that contains it", "line 1"],
     ),
     "several documents": (["eval", run() + "---\n" + run()], ["not YAML", "document"]),
     "a tag of Python": (

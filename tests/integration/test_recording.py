@@ -48,7 +48,7 @@ def saved(folder: Path) -> int:
 
 
 def series(key: str) -> list[float]:
-    found = [one for one in scrape() if one.tags["application"] == "Brightness"]
+    found = [one for one in scrape() if one.tags.get("application") == "Brightness"]
     return [one.value for one in found if one.key("outcome") == key]
 
 

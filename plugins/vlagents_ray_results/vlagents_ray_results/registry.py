@@ -17,6 +17,6 @@ BUNDLE = RegistryEntry(
 )
 VERIFY = RegistryEntry(
     "vlagents_ray_results.commands:verify_command",
-    "Execute the recorded actions of a bundle, and print the reproduced success rates.",
+    "Execute the actions of a bundle, and print the reproduced rates.",
     examples=("verify first.bundle.zip", "verify first.bundle.zip --replay 10 --out runs/check"),
 )

@@ -26,7 +26,7 @@ from vlagents_ray import Obs
 from vlagents_ray.errors import (
     ConfigError,
     Forbidden,
-    PolicyUnavailable,
+    NoReplica,
     TooManyRequests,
     Unauthorized,
 )
@@ -345,7 +345,7 @@ def test_each_request_of_a_message_is_charged_to_the_key_once(
     sender.send(message, decoded, Calls(ignore), admission=admission)
     engine.close()
     # The engine has not been started.
-    assert [type(reply.error) for reply in message.replies] == [PolicyUnavailable] * 3
+    assert [type(reply.error) for reply in message.replies] == [NoReplica] * 3
     with pytest.raises(TooManyRequests):
         caller.take_request()
 

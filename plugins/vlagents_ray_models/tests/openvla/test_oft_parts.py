@@ -70,5 +70,5 @@ def test_it_acts_with_pushed_parts_by_the_names_of_upstreams_files(policy: OpenV
 
 
 def test_an_adapter_is_rejected_since_its_head_was_trained_with_it() -> None:
-    with pytest.raises(ConfigError, match=r"adapter: expected none, .*got '/runs/a'; merge it"):
+    with pytest.raises(ConfigError, match="adapter: there is no such setting"):
         OpenVLAOFT.from_config({"checkpoint": "none", "adapter": "/runs/a"})
