@@ -60,6 +60,8 @@ class LivePart(ReplicaPart):
         """Return the events since the snapshot with the number `since`, see `ReplicaView.read`."""
         return self.view.read(since, shown)
 
-    def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+    def press(
+        self, session: str, do: str, by: str, episode: str | None = None
+    ) -> dict[str, Any] | None:
         """Give a command to a session of this replica, see `ReplicaView.press`."""
-        return self.view.press(session, do, by)
+        return self.view.press(session, do, by, episode)
