@@ -91,10 +91,10 @@ _VLAGENTS = {
     "gripper": {"key": "arm/gripper"},
     "instruction": "language_instruction",
 }
-PROTOCOLS: dict[str, tuple[str, Any]] = {  # scheme and path of the URL, and the mapping
+# Scheme and path of the URL, and the mapping. RoboArena's protocol has no name for relative actions.
+PROTOCOLS: dict[str, tuple[str, Any]] = {
     "openpi": ("ws://{host}/openpi", _KEYS),
     "openpi-batch": ("ws://{host}/openpi", _KEYS),
-    "roboarena": ("ws://{host}/roboarena", _KEYS),
     "openvla": ("http://{host}/act", _KEYS),
     "vla_eval": ("ws://{host}/vla-eval", _VLA_EVAL),
     "gr00t": ("tcp://127.0.0.1:{gr00t}", _GR00T),
@@ -239,7 +239,6 @@ class Players:
             ports = {name: free_port() for name in ("gr00t", "vlagents")}
             dialects = {
                 "openpi": {"mapping": _KEYS},
-                "roboarena": {"mapping": _KEYS, "action_space": "cartesian_position"},
                 "openvla": {"mapping": _KEYS, "chunk": True},
                 "vla_eval": {"mapping": _VLA_EVAL, "execute": EXECUTE},
                 "gr00t": {"mapping": _GR00T, "port": ports["gr00t"]},
