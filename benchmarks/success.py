@@ -91,7 +91,7 @@ _VLAGENTS = {
     "gripper": {"key": "arm/gripper"},
     "instruction": "language_instruction",
 }
-# Scheme and path of the URL, and the mapping. RoboArena's protocol has no name for relative actions.
+# Scheme and path of the URL, and the mapping. RoboArena has no name for relative actions.
 PROTOCOLS: dict[str, tuple[str, Any]] = {
     "openpi": ("ws://{host}/openpi", _KEYS),
     "openpi-batch": ("ws://{host}/openpi", _KEYS),
