@@ -283,8 +283,11 @@ class BatchQueue:
         """
         while True:
             with self._lock:
-                is_held = self._waiting.is_held(self._clock())
-                ready = self._is_ready(is_held)
+                # Without robots, nothing is held; each function call here delays every act.
+                waiting = self._waiting
+                is_held = waiting.room is not None and waiting.is_held(self._clock())
+                must_return = self._closed or self._interrupted
+                ready = must_return or (waiting.size > 0 and not is_held)
                 self._asleep = not ready
             had_event = self.poller.poll(0.0) if ready else self._wait_for_event(is_held)
             self._asleep = False
