@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from io import StringIO
@@ -273,6 +274,46 @@ def test_a_case_in_real_time_without_a_single_step_has_no_ticks_that_waited(tmp_
     _, text = in_real_time(tmp_path, {"waits": [True] * 2, "moves on": [False] * 2}, steps=0)
     assert "in real time: -100.0 points to the synchronous score (" in text
     assert "; 0% of its ticks" in text
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_failures_that_waiting_would_have_saved_are_those_of_a_direct_count(
+    tmp_path: Path, seed: int
+) -> None:
+    draw = random.Random(seed)
+    likely = draw.choice([0.0, 0.3, 0.9, 1.0])
+    outcomes = {
+        "waits": [draw.random() < 0.9 for _ in range(draw.randint(1, 9))],
+        "moves on": [draw.random() < likely for _ in range(draw.randint(1, 9))],
+    }
+    summary, text = in_real_time(tmp_path, outcomes)
+    page = write_report(summary.results, tmp_path / "report.html").read_text()
+
+    pairs = list(zip(outcomes["moves on"], outcomes["waits"], strict=False))
+    failures = sum(not solved for solved, _ in pairs)
+    saved = sum(not solved and synchronously for solved, synchronously in pairs)
+    told = (
+        f"policy, moves on in real time: {saved} of {failures} failures under delay were solved "
+        "synchronously on the same starts"
+    )
+    assert (told in text) == (failures > 0)
+    assert (told.replace("1 failures", "1 failure") in page) == (failures > 0)
+    if not failures:
+        assert "under delay" not in text + page
+
+
+def test_each_latency_is_paired_with_the_one_synchronous_suite(tmp_path: Path) -> None:
+    outcomes = {"waits": [True] * 4, "moves on": [True] + [False] * 3, "late": [False] * 4}
+    clocks = {"moves on": 0.1, "late": 0.3}
+    suites = [
+        {"name": name, "envs": [LINE], "episodes": 4}
+        | ({"clock": {"latency": clocks[name]}} if name in clocks else {})
+        for name in outcomes
+    ]
+    config = {"policies": [{}], "suites": suites, "out": tmp_path / "out"}
+    text = printed(recorded(EvalConfig.model_validate(config), outcomes))
+    assert "policy, moves on in real time: 3 of 3 failures under delay" in text
+    assert "policy, late in real time: 4 of 4 failures under delay" in text
 
 
 def test_console_report_and_summary_tell_the_same_gap(tmp_path: Path) -> None:

@@ -424,11 +424,17 @@ def _clock_gaps(summary: Summary) -> list[str]:
         steps = max(1, sum(result.steps for result in counted))
         waited = sum(result.ticks_waited for result in counted) / steps
         low, high = gap.total.interval
+        pairs = gap.total.pairs
         lines.append(
-            f"{gap.a}: {100 * (gap.total.pairs.difference or 0):+.1f} points to the synchronous "
-            f"score ({100 * low:+.1f} to {100 * high:+.1f}, {gap.total.pairs.total} pairs); "
+            f"{gap.a}: {100 * (pairs.difference or 0):+.1f} points to the synchronous "
+            f"score ({100 * low:+.1f} to {100 * high:+.1f}, {pairs.total} pairs); "
             f"{waited:.0%} of its ticks waited for an answer"
         )
+        if pairs.failures_of_a:
+            lines.append(
+                f"{gap.a}: {pairs.only_b} of {pairs.failures_of_a} failures under delay were "
+                "solved synchronously on the same starts"
+            )
     return lines
 
 

@@ -201,6 +201,11 @@ class Pairs:
         return self.both + self.only_a + self.only_b + self.neither
 
     @property
+    def failures_of_a(self) -> int:
+        """The number of episodes that A did not solve; B solved `only_b` of them."""
+        return self.only_b + self.neither
+
+    @property
     def net(self) -> int:
         """The number of episodes that only A solved, minus those that only B solved."""
         return self.only_a - self.only_b
