@@ -15,9 +15,18 @@ from normal_steps import logprob_of_steps
 from pushed_weights import check_pushed_weights
 from shared_readings import check_shared_readings
 
-from vlagents_ray import Act, Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
-from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT
+from vlagents_ray.interface import (
+    BEHAVIOUR,
+    DELAY,
+    DISTRIBUTION,
+    GIVEN,
+    LEFTOVER,
+    SAMPLES,
+    WANT,
+    Act,
+    Obs,
+)
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.adapter import CONFIG as ADAPTER_CONFIG
 from vlagents_ray.policies.base.adapter import WEIGHTS as ADAPTER_WEIGHTS
@@ -58,24 +67,44 @@ ROBOTS = {
 }
 ALL = ["logprob", "entropy", "replay"]
 LEVEL = 0.5
+LONGEST = 3  # longest prefix of a policy that was trained with prefixes, rows
 # largest difference between the actions of a batch and of a single row, in float32 on a CPU
 BATCHED = 1e-5
 SUMMED = 2e-3  # largest error of a sum of 5 log-probabilities, in float32
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path: Path = tmp_path_factory.mktemp("reference")
+def written(path: Path, longest_prefix: int = 0) -> Path:
+    """Write a checkpoint with random weights, which are the same for each `longest_prefix`."""
     words = sorted({word for text in WORDS for word in words_of(text)})
-    sizes = NetworkSizes(words=len(words), width=32, head=32, queries=4, blocks=1, token_width=16)
+    small: dict[str, Any] = {"width": 32, "head": 32, "queries": 4, "blocks": 1, "token_width": 16}
+    sizes = NetworkSizes(words=len(words), longest_prefix=longest_prefix, **small)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        values = network.ReferenceNetwork(sizes).state_dict()
+        built = network.ReferenceNetwork(sizes)
+        if longest_prefix:  # as if it had been trained
+            torch.nn.init.normal_(built.given[2].weight)
+            torch.nn.init.normal_(built.given[2].bias)
+        values = built.state_dict()
     checkpoint = Checkpoint(sizes=sizes, words=words, embodiments=ROBOTS)
     (path / CONFIG).write_text(checkpoint.model_dump_json())
     with (path / WEIGHTS).open("wb") as file:
         write_values(file, {name: value.numpy() for name, value in values.items()})
     return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("reference"))
+
+
+@pytest.fixture(scope="module")
+def prefixed_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("prefixed"), LONGEST)
+
+
+@pytest.fixture(scope="module")
+def prefixed(prefixed_folder: Path) -> Any:
+    return made(prefixed_folder)
 
 
 def made(folder: Path, **config: Any) -> Any:
@@ -198,6 +227,66 @@ def test_frozen_rows_come_back_as_planned_and_later_ones_follow_the_plan(loaded:
         np.abs(free[: len(plan)] - plan).mean(1),
     )
     assert (off[3:] < without[3:]).all()
+
+
+PLAN = np.random.default_rng(9).uniform(-1, 1, (6, 4)).astype(np.float32)
+
+
+def planned(seed: int, delay: int, plan: np.ndarray = PLAN) -> Obs:
+    return seen(seed, **{LEFTOVER: plan, DELAY: delay})
+
+
+@pytest.mark.parametrize("settings", [{}, {"dtype": "bfloat16"}, {"compile": True}])
+@pytest.mark.parametrize("delay", [1, LONGEST, LONGEST + 2])
+def test_a_trained_policy_returns_its_prefix_unchanged_and_continues_it(
+    prefixed_folder: Path, delay: int, settings: dict[str, Any]
+) -> None:
+    with counting_compiler():
+        policy = made(prefixed_folder, **settings)
+        act = begun(policy, 0).act(planned(0, delay))
+        other = begun(policy, 0).act(planned(0, delay, -PLAN)).action
+    length = min(delay, LONGEST)
+    assert policy.longest_prefix == LONGEST
+    assert act.info[GIVEN] == length
+    np.testing.assert_array_equal(act.action[:length], PLAN[:length])
+    assert np.abs(act.action[length:] - other[length:]).max() > 100 * BATCHED
+
+
+def test_only_the_rows_of_the_prefix_are_read(prefixed: Any) -> None:
+    expected = begun(prefixed, 0).act(planned(0, 2)).action
+    changed = np.concatenate([PLAN[:2], 5 + PLAN[2:]])
+    np.testing.assert_array_equal(begun(prefixed, 0).act(planned(0, 2, changed)).action, expected)
+    act = begun(prefixed, 0).act(planned(0, 3, PLAN[:1]))  # a plan that is shorter than the delay
+    assert act.info[GIVEN] == 1
+
+
+def test_without_a_prefix_a_trained_policy_computes_as_if_it_had_no_input_for_one(
+    loaded: Any, prefixed: Any
+) -> None:
+    assert loaded.longest_prefix == 0
+    expected = begun(loaded, 0).act(seen(0)).action
+    for obs in (seen(0), planned(0, 0), planned(0, 2, PLAN[:0])):
+        act = begun(prefixed, 0).act(obs)
+        assert GIVEN not in act.info
+        np.testing.assert_array_equal(act.action, expected)
+
+
+def test_prefixes_of_other_sessions_change_nothing(prefixed: Any) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        views = []
+        for seed in range(int(rng.integers(2, 6))):
+            plan = rng.uniform(-1, 1, (int(rng.integers(1, 8)), 4)).astype(np.float32)
+            delay = int(rng.integers(0, 8))
+            views.append(planned(seed, delay, plan) if rng.random() < 0.7 else seen(seed))
+        acts = prefixed.act_batch(views, [begun(prefixed, i) for i in range(len(views))])
+        for i, (obs, act) in enumerate(zip(views, acts, strict=True)):
+            alone = begun(prefixed, i).act(obs)
+            length = alone.info.get(GIVEN, 0)
+            assert act.info.get(GIVEN, 0) == length
+            np.testing.assert_allclose(act.action, alone.action, atol=BATCHED)
+            if length:
+                np.testing.assert_array_equal(act.action[:length], obs.info[LEFTOVER][:length])
 
 
 def test_the_log_probability_is_the_one_that_a_learner_computes(learnt: Any) -> None:

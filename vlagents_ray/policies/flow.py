@@ -338,6 +338,8 @@ class FlowPasses(abc.ABC):
         self._velocity = compilation.core("velocity", self._step, by_regions=regions)
         self._flows: dict[int, Callable[..., Any]] = {}  # number of steps -> core of the whole flow
         self.by_row = False  # whether `velocity` accepts a time for each row of a chunk, (B, H)
+        # Whether the model was trained to begin chunks with given rows. It is then not guided.
+        self.has_prefixes = False
 
     def encode_images(self, images: Sequence[Any]) -> Sequence[Any]:
         """Return the input of `encode` for images (P, 3, H, W)."""
@@ -386,6 +388,19 @@ class FlowPasses(abc.ABC):
             A tensor (B, K, …). Step k receives `[:, k]`. By default, these are the times.
         """
         return times
+
+    def with_prefixes(self, encoded: Any, actions: Any, frozen: Any) -> Any:
+        """Return the encoded inputs of chunks that begin with given rows.
+
+        By default, these are the encoded inputs: the model then reads the given rows from the noisy
+        actions, at flow time 0 (`by_row`).
+
+        Args:
+            encoded: The first result of `encode`, for B rows.
+            actions: Chunks whose first rows are given, (B, H, D).
+            frozen: 1.0 for given rows, 0.0 for other rows, (B, H, 1).
+        """
+        return encoded
 
     @abc.abstractmethod
     def velocity(self, constants: Sequence[Any], actions: Any, times: Any) -> Any:
@@ -437,7 +452,12 @@ class FlowPasses(abc.ABC):
         changes: list[Change] = []
 
         guide = Guide.for_rows(rows, horizon, width)
-        if guide is not None:
+        frozen = None
+        if guide is not None and self.has_prefixes:
+            prefixes = guide.to(convert)
+            start, frozen = prefixes.insert_frozen(start), prefixes.frozen
+            changes.append(prefixes.keep)
+        elif guide is not None:
             converted = guide.to(convert)
             changes.append(
                 partial(converted.steer, noise=start, steps=steps, limit=config.guidance)
@@ -446,7 +466,9 @@ class FlowPasses(abc.ABC):
         if random is not None:
             changes.append(random.change)
 
-        flow = self.sample(*inputs, noise=start, owners=owners, steps=steps, changes=changes)
+        flow = self.sample(
+            *inputs, noise=start, owners=owners, steps=steps, changes=changes, frozen=frozen
+        )
         outputs = {} if random is None else random.outputs(config.execute, dim)
         return fetch(flow), outputs
 
@@ -478,8 +500,8 @@ class FlowPasses(abc.ABC):
             owners: The index of the observation of each row.
             steps: The number of steps of the flow.
             changes: See `follow`.
-            frozen: With `by_row`, 1.0 for the rows of chunks that are already actions, at flow time
-                0, and 0.0 for other rows, (B, H, 1).
+            frozen: 1.0 for the rows of chunks that are already actions, and 0.0 for other rows, (B,
+                H, 1); None if there are no such rows. With `by_row`, their flow time is 0.
             states: The states of a memory, an argument that LeRobot's π0.5 passes since 0.6.1. It
                 is None, since models with a memory are rejected.
             state_masks: As `states`.
@@ -495,7 +517,10 @@ class FlowPasses(abc.ABC):
             index = torch.tensor(owners).to(mask.device, non_blocking=True)
             encoded, present, state = encoded[index], present[index], state[index]
 
-        changed = partial(self._flow, steps, changes, frozen)
+        if frozen is not None:
+            encoded = self.with_prefixes(encoded, noise, frozen)
+
+        changed = partial(self._flow, steps, changes, frozen if self.by_row else None)
         flow = changed if changes else self._whole_flow(steps)
         return flow(encoded, present, state, noise)
 

@@ -38,6 +38,9 @@ class NetworkSizes(BaseModel, extra="forbid", frozen=True):
     looks: int = 2  # number of times that the queries attend to the images
     head: int = 256  # width of the flow's network
     blocks: int = 3  # number of blocks of the flow's network
+    # Largest number of rows of the executed plan with which a chunk begins; 0: the network was not
+    # trained with given rows, and has no input for them.
+    longest_prefix: int = 0
 
 
 class Embodiment(BaseModel, extra="forbid", frozen=True):

@@ -145,6 +145,15 @@ class ReferenceNetwork(nn.Module):
         self.why = nn.Linear(2 * sizes.head, sizes.head)
         self.blocks = nn.ModuleList(_Block(sizes.head) for _ in range(sizes.blocks))
         self.result = nn.Linear(sizes.head, sizes.horizon * sizes.action)
+        if sizes.longest_prefix:
+            self.given = nn.Sequential(
+                nn.Linear(sizes.horizon * (sizes.action + 1), sizes.head),
+                nn.SiLU(),
+                nn.Linear(sizes.head, 2 * sizes.head),
+            )
+            # At the start of its training, the network ignores the given rows.
+            nn.init.zeros_(self.given[2].weight)
+            nn.init.zeros_(self.given[2].bias)
         steps = torch.linspace(-1, 1, sizes.side // sizes.stride)
         positions = torch.cartesian_prod(steps, steps).flip(-1)  # (tokens, 2): x, y
         self.register_buffer("grid", positions, persistent=False)
@@ -170,11 +179,25 @@ class ReferenceNetwork(nn.Module):
             queries = look(queries, cameras, self.grid)
         return silu(self.context(torch.cat([queries.flatten(1), state], -1)))
 
+    def with_prefixes(self, context: Tensor, actions: Tensor, frozen: Tensor) -> Tensor:
+        """Return the context of chunks that begin with given rows, (B, 2 * head).
+
+        The context of a chunk without given rows is not changed.
+
+        Args:
+            context: The context of each chunk, (B, 2 * head).
+            actions: Chunks whose first rows are given, (B, H, D). The other rows are not read.
+            frozen: 1.0 for given rows, 0.0 for other rows, (B, H, 1).
+        """
+        rows = torch.cat([frozen, actions * frozen], -1).flatten(1).to(context.dtype)
+        has_prefix = frozen[:, 0].to(context.dtype)
+        return context + has_prefix * self.given(rows)
+
     def velocity(self, context: Tensor, actions: Tensor, times: Tensor) -> Tensor:
         """Return the velocity, noise minus actions, (B, H, D).
 
         Args:
-            context: The context of each row, (B, 2 * head).
+            context: The context of each row, (B, 2 * head), from `encode` or `with_prefixes`.
             actions: The noisy actions, (B, H, D).
             times: The flow times, (B,); 1 is noise.
         """

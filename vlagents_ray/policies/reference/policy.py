@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,7 +11,7 @@ from pydantic import Field
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import Obs
+from vlagents_ray.interface import GIVEN, Obs
 from vlagents_ray.policies.base import (
     AdapterConfig,
     ModelPolicy,
@@ -49,6 +49,9 @@ class ReferencePasses(FlowPasses):
     def velocity(self, constants: Sequence[Any], actions: Any, times: Any) -> Any:
         encoded, _, _ = constants
         return self.model.velocity(encoded, actions.to(encoded.dtype), times).float()
+
+    def with_prefixes(self, encoded: Any, actions: Any, frozen: Any) -> Any:
+        return self.model.with_prefixes(encoded, actions, frozen)
 
 
 class ReferenceConfig(AdapterConfig):
@@ -115,6 +118,15 @@ class Reference(ModelPolicy):
         """Whether a chunk continues the executed plan, which requires `actions: chunk`."""
         return self.config.actions == "chunk"
 
+    @property
+    def longest_prefix(self) -> int:
+        """The largest number of rows of the executed plan with which a chunk begins; 0 if the
+        checkpoint was not trained with such prefixes, in which case chunks are guided.
+        """
+        if self.model is None or not self.continues_plans:
+            return 0
+        return int(self.model.checkpoint.sizes.longest_prefix)
+
     def load(self) -> LoadedReference:
         """Read the checkpoint, choose its embodiment, and move the network to the device."""
         folder = find_checkpoint(
@@ -138,6 +150,7 @@ class Reference(ModelPolicy):
         network = read_network(checkpoint.sizes, folder)
         network = network.eval().requires_grad_(False).to(device, dtype)
         passes = ReferencePasses(network, self.compilation)
+        passes.has_prefixes = checkpoint.sizes.longest_prefix > 0
         cameras = model_inputs.choose_cameras(self.config.cameras, robot.cameras, CAMERAS)
         return LoadedReference(network, checkpoint, robot, cameras, dtype, passes, Staging(device))
 
@@ -175,6 +188,13 @@ class Reference(ModelPolicy):
         model, torch = self.loaded(), require("torch")
         firsts, owners = shared_frames(rows)
         sizes = model.checkpoint.sizes
+        prefixes = [0] * len(rows)
+        if self.longest_prefix:
+            prefixes = [self._prefix(row) for row in rows]
+            rows = [
+                replace(row, delay=length, leftover=row.leftover if length else None)
+                for row, length in zip(rows, prefixes, strict=True)
+            ]
         with torch.inference_mode():
             inputs = self._inputs([rows[i] for i in firsts])
             tokens = inputs["tokens"]
@@ -190,7 +210,16 @@ class Reference(ModelPolicy):
                 dim=sizes.action,
                 convert=model.staging.upload,
             )
-        return [Prediction(flow, behaviour=outputs.get(i, {})) for i, flow in enumerate(flows)]
+        predictions = []
+        for i, (flow, length) in enumerate(zip(flows, prefixes, strict=True)):
+            info = {GIVEN: length} if length else {}
+            predictions.append(Prediction(flow, behaviour=outputs.get(i, {}), info=info))
+        return predictions
+
+    def _prefix(self, row: Row) -> int:
+        """Return the number of rows of the executed plan with which a row's chunk begins."""
+        plan = () if row.leftover is None else row.leftover
+        return min(row.delay, len(plan), self.longest_prefix)
 
     def _inputs(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Stack the last frames of rows, converted to the dtype of the network."""
