@@ -34,7 +34,6 @@ from vlagents_ray.evaluate.results.statistics import (
     difference_interval,
     holm,
     mcnemar,
-    wilson,
 )
 from vlagents_ray.images.codecs import ImageCodec
 from vlagents_ray.interface import Agent
@@ -46,6 +45,7 @@ from vlagents_ray.policies.reference.checkpoint import WEIGHTS
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.ports import free_port
+from vlagents_ray.success import wilson
 from vlagents_ray.weights.safetensors import read_values, write_values
 from vlagents_ray_dialects.upstream import Upstream
 from vlagents_ray_learn import Publisher

@@ -10,6 +10,7 @@ MOST_SEED = 4_000_000_000
 MOST_STEP = 10**12  # largest step of training
 MOST_STEPS_NAMED = 10_000  # checkpoints of one sweep
 MOST_ROWS = 10_000  # largest number of rows of an action chunk
+MOST_HZ = 10_000  # largest rate of a robot or an environment, 1/s
 MOST_WORKERS = 10_000
 MOST_RETRIES = 1_000
 MOST_CPUS = 10_000  # largest number of CPUs, or of GPUs

@@ -23,8 +23,8 @@ import yaml
 from reference import ROOT, folder_of, own_entries
 
 from vlagents_ray.evaluate import exports
-from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.registry import RegistryEntry
+from vlagents_ray.success import wilson
 
 # Success rates, which the tests named in the file reproduce.
 RATES = json.loads((ROOT / "tests/rates.json").read_text())

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from vlagents_ray.evaluate import EvalConfig, Results, SuiteConfig, evaluate
-from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.local_agent import LocalPolicy
+from vlagents_ray.success import wilson
 from vlagents_ray_results.verification import verify
 
 torch = pytest.importorskip("torch")

@@ -33,9 +33,9 @@ from vlagents_ray.evaluate.results.statistics import (
     holm,
     mcnemar,
     paired_test,
-    wilson,
 )
 from vlagents_ray.evaluate.results.summary import Group, Summary
+from vlagents_ray.success import wilson
 
 if TYPE_CHECKING:
     from vlagents_ray.evaluate.plan.cases import most_cpus, most_gpus

@@ -19,7 +19,8 @@ from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results.early_stopping import CaseStopping
 from vlagents_ray.evaluate.results.reader import rate_of
-from vlagents_ray.evaluate.results.statistics import Rate, confidence_sequence, pooled, wilson
+from vlagents_ray.evaluate.results.statistics import Rate, confidence_sequence, pooled
+from vlagents_ray.success import wilson
 
 Config = Callable[..., EvalConfig]
 

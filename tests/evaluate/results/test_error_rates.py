@@ -42,9 +42,9 @@ from vlagents_ray.evaluate.results.statistics import (
     sequential_difference_interval,
     sequential_test,
     sum_of,
-    wilson,
 )
 from vlagents_ray.evaluate.results.summary import summarize
+from vlagents_ray.success import wilson
 
 LOST = None
 Outcome = bool | None

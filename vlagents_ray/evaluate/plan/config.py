@@ -24,6 +24,7 @@ from typing_extensions import Self
 from vlagents_ray.bounds import (
     MOST_CPUS,
     MOST_EPISODES,
+    MOST_HZ,
     MOST_RETRIES,
     MOST_ROWS,
     MOST_S,
@@ -46,7 +47,7 @@ Step = Annotated[int, Field(ge=0, le=MOST_STEP)]  # training step, or version of
 Workers = Annotated[int, Field(ge=0, le=MOST_WORKERS)]
 Resources = Annotated[float, Field(ge=0, le=MOST_CPUS)]  # number of CPUs or GPUs
 Seconds = Annotated[float, Field(gt=0, le=MOST_S)]
-Hertz = Annotated[float, Field(gt=0, le=10_000)]
+Hertz = Annotated[float, Field(gt=0, le=MOST_HZ)]
 
 
 class _PlanModel(BaseModel):

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import InvalidInput
+from vlagents_ray.success import wilson
 
-Z_95 = 1.959963984540054  # two-sided 95 % quantile of the standard normal distribution
 ERROR_RATE = 0.05  # probability that an interval misses the true value
 _PSEUDO_STARTS = 2.0
 
@@ -42,44 +42,6 @@ def independent_episodes(repeats: Iterable[int]) -> float:
     numbers = list(repeats)
     squares = sum(number * number for number in numbers)
     return sum(numbers) ** 2 / squares if squares else 0.0
-
-
-def wilson(successes: float, trials: float, z: float = Z_95) -> tuple[float, float]:
-    """Compute the Wilson score interval of a success probability.
-
-    E. B. Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", JASA 22
-    (1927). Unlike the textbook interval it stays inside [0, 1] and is accurate for few episodes and
-    for rates of 0 % and 100 %.
-
-    Args:
-        successes: The number of successful trials; a fraction if starts are repeated.
-        trials: The number of trials, or of independent trials (`independent_episodes`).
-        z: The quantile of the standard normal distribution; the default gives 95 %.
-
-    Returns:
-        (low, high), each in [0, 1]; (0, 1) when there are no trials.
-
-    Raises:
-        InvalidInput: `successes` is not in 0 … `trials`.
-    """
-    if not 0 <= successes <= trials:
-        raise InvalidInput(
-            f"wilson: expected 0 <= successes <= trials, got {successes} successes in {trials} "
-            "trials"
-        )
-    if trials == 0:
-        return 0.0, 1.0
-
-    rate = successes / trials
-    scale = 1 + z * z / trials
-    centre = (rate + z * z / (2 * trials)) / scale
-    half_width = z / scale * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-
-    # Without successes the lower bound is exactly 0, and without failures the upper bound is
-    # exactly 1. Floating point would give 1e-17 and 1 - 1e-16.
-    low = 0.0 if successes == 0 else centre - half_width
-    high = 1.0 if successes == trials else centre + half_width
-    return low, high
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 
 from vlagents_ray.abilities import HasWeightsId, ability
 from vlagents_ray.interface import Agent
+from vlagents_ray.success import SUCCESS_FILE
 
 # Names that training programs use for unfinished files: the folders of orbax, and the usual
 # suffixes.
@@ -42,8 +43,9 @@ _WHOLE = 2**20  # bytes; a file up to this size is read in full
 _BLOCK, _BLOCKS = 4096, 256  # bytes of a sampled block, and the number of blocks
 _LONGEST_HEADER = 10**8  # largest header that safetensors permits, bytes
 _COMMIT = re.compile(r"[0-9a-f]{40}")
-# Documentation files of a checkpoint, which do not affect its behaviour.
-_BESIDE = (".md", ".gitattributes", ".log")
+# Files of a checkpoint that do not affect its behaviour: the suffixes of documentation, and the
+# names of measurements, which may be written after the digest was recorded.
+_BESIDE, _MEASURED = (".md", ".gitattributes", ".log"), (SUCCESS_FILE,)
 
 
 def unfinished(path: Path) -> str | None:
@@ -197,7 +199,8 @@ def digest(paths: Iterable[Path]) -> str:
     - From any other file, 256 blocks of 4 KiB at equal distances are read.
 
     Therefore, different weights, statistics or settings have different digests, but a deliberate
-    change of a few bytes may not be noticed. Hidden files and READMEs are not covered.
+    change of a few bytes may not be noticed. Hidden files, READMEs and curves of success are not
+    covered.
     """
     sha256 = hashlib.sha256()
     for path in paths:
@@ -245,7 +248,7 @@ def _below(folder: Path, seen: set[str]) -> Iterator[Path]:
             if entry.name.startswith((".", "__pycache__")):
                 continue
             if entry.is_file():
-                if entry.suffix not in _BESIDE:
+                if entry.suffix not in _BESIDE and entry.name not in _MEASURED:
                     yield entry
             elif entry.is_dir() and os.path.realpath(entry) not in seen:
                 yield from _below(entry, seen)
