@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import select
 import socket
 import threading
@@ -25,13 +24,11 @@ _OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}
 
 _ANSWER_S = 2.0  # s, time limit for the first byte of the first replica's answer
 _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
-SPIN_S = 150e-6  # s to poll for an answer before sleeping
 # s to wait for a replica's own port: a firewall may drop the packets
 DIRECT_S = 1.0
 # s, pause before an own port that could not be used is tried again: the replica may have been
 # restarting or full, or the network down
 AVOIDED_S = 30.0
-FAST_S = 600e-6  # s; if an answer takes less, including the wake-up, the client polls for the next
 
 # The time without an answer after which a replica is pinged, the shortest time between two pings on
 # a connection, and the time between two checks, s. A server permits one ping per second.
@@ -102,15 +99,15 @@ class ReplicaWatch:
 
     def wait(
         self,
-        connection: socket.socket,
-        event: int,
+        poller: select.poll,
         deadline: float,
         ping: Callable[[], None] | None = None,
     ) -> None:
-        """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`, and check the replica
-        meanwhile.
+        """Sleep until a file of `poller` is ready, and check the replica meanwhile.
 
         Args:
+            poller: The poller of a socket.
+            deadline: The time limit, time.monotonic().
             ping: Sends a ping, without waiting. None while a message is being sent; then the
                 replica must read bytes of the message instead.
 
@@ -118,7 +115,11 @@ class ReplicaWatch:
             TimeoutError: The deadline has passed.
             ReplicaSilent: The client leaves the replica.
         """
-        self.wait_until(lambda limit_s: _is_ready(connection, event, limit_s), deadline, ping)
+
+        def is_ready(limit_s: float) -> bool:
+            return bool(poller.poll(math.ceil(limit_s * 1e3)))
+
+        self.wait_until(is_ready, deadline, ping)
 
     def wait_until(
         self,
@@ -252,44 +253,22 @@ def left_s(deadline: float) -> float:
     return max(1e-3, deadline - time.monotonic())
 
 
-def wait(connection: socket.socket, event: int, deadline: float) -> None:
-    """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`.
+def poller_of(connection: socket.socket, event: int) -> select.poll:
+    """Return a poller of one socket, for `select.POLLIN` or `POLLOUT`."""
+    poller = select.poll()
+    poller.register(connection, event)
+    return poller
+
+
+def wait(poller: select.poll, deadline: float) -> None:
+    """Sleep until a file of `poller` is ready.
 
     Raises:
         TimeoutError: The deadline has passed.
     """
     left_s = deadline - time.monotonic()
-    poller = select.poll()
-    poller.register(connection, event)
     if left_s <= 0 or not poller.poll(math.ceil(left_s * 1e3)):
         raise TimeoutError
-
-
-def _is_ready(connection: socket.socket, event: int, limit_s: float) -> bool:
-    """Return whether the socket is ready for `event`, or becomes ready within a time limit."""
-    poller = select.poll()
-    poller.register(connection, event)
-    return bool(poller.poll(math.ceil(limit_s * 1e3)))
-
-
-def await_answer(
-    poller: select.poll,
-    connection: socket.socket,
-    spin_until: float,
-    deadline: float,
-    watch: ReplicaWatch,
-    ping: Callable[[], None] | None,
-) -> None:
-    """Wait for `connection`, which `poller` polls, like `watch.wait`, but poll without sleeping
-    until `spin_until`, s of `perf_counter`.
-    """
-    while not poller.poll(0):  # a poll is much faster than the exception of an empty read
-        if time.perf_counter() < spin_until:
-            # Other processes can use the core meanwhile. A sleep would double the latency, because
-            # of the wake-up.
-            os.sched_yield()
-        else:
-            watch.wait(connection, select.POLLIN, deadline, ping)
 
 
 class CodecChoice:

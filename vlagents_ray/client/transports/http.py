@@ -33,14 +33,11 @@ from vlagents_ray.client.http_connection import ServerConnection
 from vlagents_ray.client.transports.base import (
     AVOIDED_S,
     DIRECT_S,
-    FAST_S,
     PROBE_S,
-    SPIN_S,
     CodecChoice,
     ConnectReport,
     ReplicaSilent,
     ReplicaWatch,
-    await_answer,
     connection_lost,
     first_timeout_s,
     left_s,
@@ -394,7 +391,6 @@ class _Link:
         self._connection: ServerConnection | None = None
         self._path = url.path.rstrip("/")
         self.alternate = ""  # the header `Link` of the last answer
-        self._answers_fast = True  # whether the last answer was immediate
 
     def exchange(
         self,
@@ -496,17 +492,12 @@ class _Link:
     def _await_answer(
         self, connection: ServerConnection, deadline: float, probe: Callable[[], bool] | None
     ) -> None:
-        """Wait for the first byte of an answer, and poll for it at first if the last one was
-        immediate.
-        """
-        begun = time.perf_counter()
-        spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
+        """Wait for the first byte of an answer."""
         watch = ReplicaWatch() if probe is None else self._watch
         watch.begin()
         ping = None if probe is None else partial(watch.probe, probe)
-        await_answer(connection.poller, connection.sock, spin_until, deadline, watch, ping)
+        watch.wait(connection.poller, deadline, ping)
         watch.received()
-        self._answers_fast = time.perf_counter() - begun < FAST_S
 
 
 class _ProxiedProbe:

@@ -23,17 +23,16 @@ import numpy as np
 
 from vlagents_ray.client.credentials import ANONYMOUS, Credentials
 from vlagents_ray.client.transports.base import (
-    FAST_S,
-    SPIN_S,
     ReplicaSilent,
     ReplicaWatch,
-    await_answer,
     connection_lost,
     no_answer,
+    poller_of,
     wait,
 )
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.images.codecs import RAW
+from vlagents_ray.polling import Polling
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import decode_replies, request_parts
 from vlagents_ray.protocol.messages import LocalAddress, Reply, Request, boot_id, peer_uid
@@ -41,6 +40,9 @@ from vlagents_ray.protocol.messages import LocalAddress, Reply, Request, boot_id
 _MESSAGE_BYTES = 128 * 1024  # the longest reply that fits in a message, plus a margin
 _CONTROL = socket.CMSG_SPACE(4)
 _PAGE = mmap.PAGESIZE
+_POLLING_S = 150e-6  # time for which the client polls for an answer before it sleeps
+# If an answer takes less, including the wake-up, the client polls for the next one.
+_FAST_S = 600e-6
 
 
 class UnixTransport(ABC):
@@ -59,6 +61,7 @@ class UnixTransport(ABC):
         self._poller = select.poll()  # polls the Unix socket
         self._buffer = bytearray(_MESSAGE_BYTES)
         self._writer = shm_layout.ShmWriter()
+        self._polling = Polling(_POLLING_S)
         self._answers_fast = True  # whether the last answer was immediate
 
     @abstractmethod
@@ -125,7 +128,7 @@ class UnixTransport(ABC):
                 try:
                     self._receive(connection)
                 except BlockingIOError:
-                    self._watch.wait(connection, select.POLLIN, deadline, self._ping)
+                    self._watch.wait(self._poller, deadline, self._ping)
             message, descriptor = self._write(requests, deadline)
             try:
                 _send_message(connection, message, deadline, descriptor)
@@ -141,14 +144,14 @@ class UnixTransport(ABC):
     ) -> list[Reply]:
         """Return the replies to these requests, and discard the replies to earlier requests."""
         begun = time.perf_counter()
-        spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
         while True:
-            await_answer(self._poller, connection, spin_until, deadline, self._watch, self._ping)
+            if not (self._answers_fast and self._polling.receives(self._poller.poll)):
+                self._watch.wait(self._poller, deadline, self._ping)
             replies = self._receive(connection)
             if replies and replies[0].answers(requests[0]):
                 if not replies[0].request_id:  # the message was rejected before it was parsed
                     self._writer = shm_layout.ShmWriter()
-                self._answers_fast = time.perf_counter() - begun < FAST_S
+                self._answers_fast = time.perf_counter() - begun < _FAST_S
                 return replies
 
     def _open(self, timeout_s: float) -> socket.socket:
@@ -170,8 +173,7 @@ class UnixTransport(ABC):
                 connection.close()
                 raise
             connection.setblocking(False)
-            self._poller = select.poll()
-            self._poller.register(connection, select.POLLIN)
+            self._poller = poller_of(connection, select.POLLIN)
             self._socket = connection
             self._watch.received()
         return self._socket
@@ -223,7 +225,7 @@ def _send_message(
                 else:
                     socket.send_fds(connection, [message], [descriptor])
             except BlockingIOError:
-                wait(connection, select.POLLOUT, deadline)
+                wait(poller_of(connection, select.POLLOUT), deadline)
             else:
                 return
     finally:

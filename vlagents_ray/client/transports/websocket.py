@@ -37,17 +37,15 @@ from vlagents_ray.client.limited_websocket import LimitedWebSocket, SharedConnec
 from vlagents_ray.client.transports.base import (
     AVOIDED_S,
     DIRECT_S,
-    FAST_S,
     PROBE_S,
-    SPIN_S,
     CodecChoice,
     ReplicaSilent,
     ReplicaWatch,
-    await_answer,
     connection_lost,
     first_timeout_s,
     left_s,
     no_answer,
+    poller_of,
     wait,
 )
 from vlagents_ray.client.transports.http import HttpTransport, http_url, no_replica, refusal
@@ -232,15 +230,13 @@ class Stream:
         self._messages: list[bytes] = []
         self._read_memory = memoryview(bytearray(_READ_BYTES))
         self._silent = False  # whether the server failed to read or answer the last message in time
-        self._answers_fast = True  # whether the last answer was immediate
 
         self._socket = socket.create_connection((host, port), timeout_s)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             self._socket.setblocking(False)
-            self._poller = select.poll()
-            self._poller.register(self._socket, select.POLLIN)
+            self._poller = poller_of(self._socket, select.POLLIN)
 
             request = self._protocol.connect()
             request.headers.update(headers or {})
@@ -248,7 +244,7 @@ class Stream:
             self._flush(deadline)
 
             while self._protocol.state is State.CONNECTING:
-                wait(self._socket, select.POLLIN, deadline)
+                wait(self._poller, deadline)
                 self._read(lambda data: self._protocol.receive_data(bytes(data)), deadline)
                 if self._protocol.handshake_exc is not None:
                     raise self._protocol.handshake_exc
@@ -290,20 +286,16 @@ class Stream:
             TimeoutError: No message arrived in time.
             ReplicaSilent: The client leaves the replica.
         """
-        begun, deadline = time.perf_counter(), time.monotonic() + timeout_s
-        spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
+        deadline = time.monotonic() + timeout_s
         try:
             while not self._messages:
                 self._check_open()
-                await_answer(
-                    self._poller, self._socket, spin_until, deadline, self._watch, self._ping
-                )
+                self._watch.wait(self._poller, deadline, self._ping)
                 self._read(self._received.parse, deadline)
         except (TimeoutError, ReplicaSilent):
             self._silent = True
             raise
         self._silent = False
-        self._answers_fast = time.perf_counter() - begun < FAST_S
         return self._messages.pop(0)
 
     def close(self) -> None:
@@ -378,7 +370,7 @@ class Stream:
             try:
                 data = data[self._socket.send(data) :]
             except BlockingIOError:
-                self._watch.wait(self._socket, select.POLLOUT, deadline)
+                self._watch.wait(poller_of(self._socket, select.POLLOUT), deadline)
                 self._watch.received()
 
 

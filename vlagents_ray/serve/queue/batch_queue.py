@@ -14,13 +14,13 @@ how long. `patience=0` disables this.
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Callable, Container, Iterable, Sequence
 from typing import NamedTuple
 
 from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.polling import Polling
 from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.queue.batch_window import BatchWindow
 from vlagents_ray.serve.queue.fair_queue import FairQueue
@@ -28,7 +28,7 @@ from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.robots_load import CostCurve, Room
 from vlagents_ray.serve.requests import PendingRequest
 
-_SPIN_S = 100e-6  # time for which the thread polls for the next request before it sleeps
+_POLLING_S = 100e-6  # time for which the thread polls for the next request before it sleeps
 _LONG_BATCH_S = 0.5  # duration of a batch after which another thread always polls, s
 # Time for which the thread sleeps while requests are held, s. Then the needs of robots are read
 # again, since a robot may have left.
@@ -87,6 +87,7 @@ class BatchQueue:
         self._interrupted = False  # whether `next` must return without a request
         # Whether a caller of `take` drives the queue; each new request then wakes that caller.
         self._driven = False
+        self._polling = Polling(_POLLING_S)
         self._dense = False  # whether requests arrive in quick succession
 
         self.poller = poller or Poller()
@@ -307,16 +308,13 @@ class BatchQueue:
         """Wait for a watched file or a wake-up call; return False if there was none within
         `idle_s`, or soon if the waiting requests are held. The thread does not count as idle then.
 
-        If the last request followed quickly, the thread polls for `_SPIN_S` before it sleeps, since
-        waking up takes as long as a fast policy. While it polls, it yields the core to other
-        processes.
+        If the last request followed quickly, the thread polls before it sleeps, since waking up
+        takes as long as a fast policy.
         """
         begun = time.perf_counter() if is_held else self._load_timer.mark_idle()
-        while self._dense and time.perf_counter() - begun < _SPIN_S:
-            if self.poller.poll(0.0):
-                self._load_timer.mark_busy()
-                return True
-            os.sched_yield()
+        if self._dense and self._polling.receives(self.poller.poll):
+            self._load_timer.mark_busy()
+            return True
         had_event = self.poller.poll(min(self._idle_s, _HELD_S) if is_held else self._idle_s)
         self._dense = self._load_timer.mark_busy() - begun < _DENSE_S
         return had_event
