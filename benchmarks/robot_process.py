@@ -3,37 +3,45 @@ JSON`, with a list of `Robot`.
 
 The process connects its robots, and writes "ready". Each line that it then reads is a run,
 {"begin": s, "counted": s, "end": s} of `time.monotonic`; at the end it writes the figures of each
-robot's ticks since `counted`. A robot whose policy is late holds still at that tick, and continues
-at the next tick: the load does not decrease when the server is slow.
+robot's ticks since `counted`.
+
+A robot with the chunk player whose policy is late holds still at that tick, and continues at the
+next tick: the load does not decrease when the server is slow. A robot with a *waiting loop*
+executes the rows of a chunk, and then waits for the next one. This is the loop of openpi
+(`ActionChunkBroker` and `Runtime` of `openpi-client`) and of vlagents (`EvalEnv.chunk_step`), and
+the plainest one for a server that has no loop of its own.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import random
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from benchmarks.own_clients import observation
+from vlagents_ray.chunking.buffer import Mode
 from vlagents_ray.chunking.fallback import Cause
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.interface import AGE_MS, CAUSE, SAFE, Act, Agent, Obs
+from vlagents_ray.interface import AGE_MS, CAUSE, CHUNK, IN_TIME, ROW, SAFE, Act, Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.robot.pacing import Pacer
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
-OURS, RAY_SERVE, OPENPI = "vlagents_ray", "ray serve", "openpi"
+OURS, RAY_SERVE, OPENPI, VLAGENTS = "vlagents_ray", "ray serve", "openpi", "vlagents"
+Loop = Literal["player", "waiting"]
 CONNECT_S = 120.0
 _TIMEOUT_S = 20.0
 _AGES = 2000  # maximum number of ages of a robot that are written
@@ -42,6 +50,14 @@ _OPENPI_KEYS = {
     "state": {"joints": "observation/state"},
     "instruction": "prompt",
 }
+_VLAGENTS_KEYS = {
+    "cameras": {"camera_0": "robot/cameras/camera_0", "camera_1": "robot/cameras/camera_1"},
+    "state": {"joints": "robot/joints"},
+    "gripper": "robot/gripper",
+    "instruction": "language_instruction",
+}
+# The protocol and the keys of the systems to which `upstream` connects.
+_UPSTREAMS = {OPENPI: ("openpi", _OPENPI_KEYS), VLAGENTS: ("vlagents", _VLAGENTS_KEYS)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +65,11 @@ class Robot:
     """One robot."""
 
     url: str
-    system: str  # one of `OURS`, `RAY_SERVE` and `OPENPI`
+    system: str  # one of `OURS`, `RAY_SERVE`, `OPENPI` and `VLAGENTS`
     hz: float
     chunk: int  # number of rows in an answer
     rows: int  # maximum number of rows of an answer that the robot executes
+    loop: Loop = "player"
 
 
 class RayServeClient(Agent):
@@ -87,11 +104,12 @@ def connect(robot: Robot) -> Agent:
     """Return the client of a robot, not connected yet."""
     if robot.system == RAY_SERVE:
         return RayServeClient(robot.url, robot.chunk)
-    if robot.system == OPENPI:
+    if robot.system in _UPSTREAMS:
+        protocol, keys = _UPSTREAMS[robot.system]
         settings = {
-            "protocol": "openpi",
+            "protocol": protocol,
             "urls": [robot.url],
-            "mapping": _OPENPI_KEYS,
+            "mapping": keys,
             "contract": {"action": {"dim": 7, "delta": True}, "chunk": robot.chunk},
             "timeout_s": _TIMEOUT_S,
         }
@@ -105,12 +123,78 @@ def connect(robot: Robot) -> Agent:
     )
 
 
+class Figures:
+    """The figures of a robot since `counted`."""
+
+    def __init__(self) -> None:
+        self.ticks = 0.0
+        self.late = 0.0  # ticks without an action, not counting waits that the loop chose
+        self.missed = 0  # ticks that the robot's own process began too late; they are also late
+        self.waits: list[float] = []  # ticks of each wait that the loop chose
+        # Rows that were executed between the observation of each answer and its first row; infinite
+        # for an answer that had no row left.
+        self.delays: list[float] = []
+        self.ages: list[float] = []  # age of each executed action, ms
+        self.failed = ""  # the last error of the policy
+        # Index of the last chunk of which a row was executed, also before `counted`.
+        self._chunk: int | None = None
+        self._is_waiting = False  # whether the last tick was a chosen wait
+
+    def count(self, info: Mapping[str, Any], *, is_counted: bool) -> None:
+        """Count a tick of the chunk player.
+
+        Args:
+            info: The info of the tick's action.
+            is_counted: Whether the tick is since `counted`.
+        """
+        row = SAFE not in info
+        if row:
+            chunk: int = info[CHUNK]
+            if chunk != self._chunk and is_counted:
+                # The answers between them had no row left, and moved no robot.
+                skipped = 0 if self._chunk is None else chunk - self._chunk - 1
+                self.delays += [math.inf] * skipped + [info[ROW]]
+            self._chunk = chunk
+        if not is_counted:
+            return
+
+        self.ticks += 1
+        # A tick that needs no action of the policy, although no operator moves the robot, is a wait
+        # that the player chose.
+        is_waiting = not row and IN_TIME not in info
+        if row:
+            self.ages.append(info[AGE_MS])
+        elif is_waiting:
+            if not self._is_waiting:
+                self.waits.append(0)
+            self.waits[-1] += 1
+        else:
+            self.late += 1
+            cause: Cause = info[CAUSE]
+            if cause not in ("waiting", "late"):
+                self.failed = info[SAFE]
+        self._is_waiting = is_waiting
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures for JSON."""
+        return {
+            "ticks": self.ticks,
+            "late": self.late,
+            "missed": self.missed,
+            "waits": self.waits,
+            "delays": self.delays,
+            "ages": self.ages if len(self.ages) <= _AGES else random.sample(self.ages, _AGES),
+            "failed": self.failed,
+        }
+
+
 class RunningRobot:
-    """A robot with its player."""
+    """A robot with its control loop."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        settings = PlayerSettings(mode="async", horizon=robot.rows, timeout_s=_TIMEOUT_S)
+        mode: Mode = "async" if robot.loop == "player" else "open_loop"
+        settings = PlayerSettings(mode=mode, horizon=robot.rows, timeout_s=_TIMEOUT_S)
         self._player = ChunkPlayer(connect(robot), settings)
         self._player.initialize()
         self._obs = observation()
@@ -127,41 +211,66 @@ class RunningRobot:
         """
         hz = self._robot.hz
         time.sleep(max(0.0, begin + random.uniform(0, 1 / hz) - time.monotonic()))
-        failed = ""
-        ages: list[float] = []
+        figures = Figures()
         try:
             self._player.reset(replace(self._obs, info={}), "measure")
-        except VLAgentsError as error:
-            return {"ticks": 1, "late": 1, "missed": 0, "ages": [], "failed": str(error)}
+        except (VLAgentsError, OSError) as error:
+            figures.ticks = figures.late = 1
+            figures.failed = str(error)
+            return figures.to_json()
 
         # A robot holds still while it waits for its first answer.
         waited_s = max(0.0, min(time.monotonic(), end) - counted)
-        ticks = late = round(waited_s * hz)
-        pacer = Pacer(hz)
+        figures.ticks = figures.late = round(waited_s * hz)
+        if self._robot.loop == "player":
+            self._play(figures, counted, end)
+        else:
+            self._wait(figures, counted, end)
+        return figures.to_json()
+
+    def _play(self, figures: Figures, counted: float, end: float) -> None:
+        """Execute a row at each tick; answers arrive in the background."""
+        pacer = Pacer(self._robot.hz)
         missed_before = 0
         while (now := time.monotonic()) < end:
             pacer.wait()
             act = self._player.act(replace(self._obs, info={}))
+            figures.count(act.info, is_counted=now >= counted)
             if now < counted:
                 missed_before = pacer.missed
-                continue
+        figures.missed = pacer.missed - missed_before
+        figures.ticks += figures.missed
+        figures.late += figures.missed
 
-            ticks += 1
-            if SAFE not in act.info:
-                ages.append(act.info[AGE_MS])
-                continue
-            late += 1
-            cause: Cause = act.info[CAUSE]
-            if cause not in ("waiting", "late"):
-                failed = act.info[SAFE]
-        missed = pacer.missed - missed_before
-        return {
-            "ticks": ticks + missed,
-            "late": late + missed,
-            "missed": missed,
-            "ages": ages if len(ages) <= _AGES else random.sample(ages, _AGES),
-            "failed": failed,
-        }
+    def _wait(self, figures: Figures, counted: float, end: float) -> None:
+        """Execute a row at each step; the step that needs a new chunk waits for it.
+
+        As in openpi's `Runtime`, a step begins one period after the last one, or as soon as that
+        has ended.
+        """
+        hz = self._robot.hz
+        step = time.monotonic()
+        while step < end:
+            time.sleep(max(0.0, step - time.monotonic()))
+            failed = ""
+            act: Act | None = None
+            try:
+                act = self._player.act(replace(self._obs, info={}))
+            except (VLAgentsError, OSError) as error:
+                failed = str(error)
+            done = time.monotonic()
+            waited = max(0.0, (done - step) * hz - 1)
+            if step >= counted:
+                figures.ticks += 1 + waited
+                if act is None:
+                    figures.late += 1 + waited
+                    figures.failed = failed
+                else:
+                    figures.ages.append(act.info[AGE_MS])
+                    if act.info[ROW] == 0:
+                        figures.delays.append(0)
+                        figures.waits.append(waited)
+            step = max(step + 1 / hz, done)
 
     def close(self) -> None:
         """Close the connection."""

@@ -4,7 +4,8 @@ replica.
 `PYTHONPATH=tests/support python -m tests.simulation.robots --seeds 100000` runs random worlds, and
 checks each. With `--fleets` in place of `--seeds`, it prints the largest fleets in time, and the
 robots in time of smaller and larger fleets: without slack, with the order by slack, and with the
-pace as well.
+pace as well. With `--successful`, it prints the largest fleets of successful robots, and the tasks
+per GPU-hour, of these and of the loops and servers of other systems (`benchmarks.successful`).
 """
 
 from __future__ import annotations
@@ -20,9 +21,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 from in_flight import AnySession, message_of_one
 
+from benchmarks.successful import CHECKPOINT, FleetSuccess, ServedRobot, curve_of
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.messages import Priority, Request
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.fair_queue import BEHIND_OTHERS_S, PATIENCE_S
@@ -35,6 +39,7 @@ from vlagents_ray.serve.queue.robots_load import (
     robots_load,
 )
 from vlagents_ray.serve.requests import Origin, PendingRequest
+from vlagents_ray.success import SuccessCurve
 
 PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled
 GRAPHS = CostCurve(0.0415, 0.0105)
@@ -63,6 +68,9 @@ class Robot:
     states_slack: bool = True
     lies: bool = False  # whether it claims in each request to be about to run out of rows
     obeys: bool = True  # whether it replans at the requested pace
+    # Whether it executes a chunk, and then waits for the next one, like the loops of openpi and
+    # vlagents.
+    stops: bool = False
     source: str = ""
     executed: int = 0  # number of executed rows
     end: int = 0  # number of rows to the end of its plan, including executed ones
@@ -71,6 +79,9 @@ class Robot:
     ticks: int = 0
     starved: int = 0
     ages: list[float] = field(default_factory=list)
+    # The ticks of each wait of a robot that stops, and the delay of each answer, in rows.
+    waits: list[float] = field(default_factory=list)
+    delays: list[float] = field(default_factory=list)
     waiting: PendingRequest | None = None
     waits_until: float = 0.0  # time before which a request is useless, s
     inference_s: float = 0.0  # duration of its last batch
@@ -80,6 +91,11 @@ class Robot:
     def share_in_time(self) -> float:
         """Return the share of ticks that had an action."""
         return 1 - self.starved / self.ticks if self.ticks else 0.0
+
+    def served(self) -> ServedRobot:
+        """Return the service to the robot."""
+        ticks = self.ticks + sum(self.waits)
+        return ServedRobot(self.hz, ticks, self.starved, self.waits, self.delays)
 
 
 @dataclass
@@ -105,7 +121,9 @@ class World:
         deadlines: float = 0.0,
         jitter: float = 0.02,
         begin_s: float | None = None,
+        largest: int = LARGEST,
     ) -> None:
+        self.largest = largest  # maximum size of a batch
         self.begin_s = begin_s  # time within which robots begin; None for the duration of one chunk
         self.draw = random.Random(seed)
         self.costs, self.slack = costs, slack
@@ -115,7 +133,7 @@ class World:
         self.now = 0.0
         self.measured_from = 0.0  # earlier ticks are not counted
         self.queue = BatchQueue(
-            LARGEST,
+            largest,
             sessions=AnySession(),
             clock=lambda: self.now,
             poller=_NoFiles(),  # type: ignore[arg-type]
@@ -142,7 +160,10 @@ class World:
             robot.plan.began = index - len(self.robots)  # their resets were before the first tick
             round_s = max(1.0, robot.rows / robot.hz)
             phase = self.draw.random() * (round_s if self.begin_s is None else self.begin_s)
-            self.at(phase, lambda robot=robot, phase=phase: self._tick(robot, phase, 0))
+            if robot.stops:
+                self.at(phase, lambda robot=robot: self._stop(robot))
+            else:
+                self.at(phase, lambda robot=robot, phase=phase: self._tick(robot, phase, 0))
         for simulation in self.simulations:
             self.at(self.draw.random() * 0.1, lambda one=simulation: self._simulate(one))
         while self._due and self._due[0][0] <= seconds:
@@ -176,7 +197,26 @@ class World:
             robot.starved += is_measured
             robot.late_s = self.now
 
-    def _ask(self, robot: Robot, slack_s: float, at: float) -> None:
+    def _stop(self, robot: Robot) -> None:
+        """Stop after the last row of a chunk, request the next chunk, and execute all its rows."""
+        at, period_s = self.now, 1 / robot.hz
+
+        def move() -> None:
+            # The first row is due in any case one tick after the last row of the previous chunk.
+            first = max(self.now, at + period_s)
+            if at >= self.measured_from:
+                robot.ticks += robot.rows
+                robot.waits.append((first - at) * robot.hz - 1)
+                robot.delays.append(0)
+                robot.ages += [first - at + row * period_s for row in range(robot.rows)]
+            robot.begun = True
+            self.at(first + (robot.rows - 1) * period_s, lambda: self._stop(robot))
+
+        self._ask(robot, 0.0, at, move)
+
+    def _ask(
+        self, robot: Robot, slack_s: float, at: float, done: Callable[[], None] | None = None
+    ) -> None:
         arrived = self.now + WIRE_S
         row = robot.executed
         pending = PendingRequest(
@@ -192,7 +232,8 @@ class World:
             pending.waits_behind_others = robot.plan.waits_behind_others
         if self.deadlines and self.draw.random() < self.deadlines:
             pending.deadline = arrived + self.draw.choice([0.05, 0.3, 2.0])
-        pending.observer_data = {"done": lambda: self._receive(robot, row, at), "robot": robot}
+        done = done or (lambda: self._receive(robot, row, at))
+        pending.observer_data = {"done": done, "robot": robot}
         robot.waiting = pending
         self.sent += 1
         self.at(arrived, lambda: self._put(pending))
@@ -251,7 +292,7 @@ class World:
 
     def _check(self, batch: list[PendingRequest]) -> None:
         """Check the properties of each batch."""
-        assert len(batch) <= LARGEST
+        assert len(batch) <= self.largest
         assert len({pending.session_id for pending in batch}) == len(batch), (
             "two requests of one session"
         )
@@ -313,8 +354,11 @@ class World:
         end = row + robot.rows
         if end == robot.executed == robot.end:
             end += 1  # the last row may be executed one tick late
-        if end > robot.executed and end > robot.end:
+        has_row = end > robot.executed and end > robot.end
+        if has_row:
             robot.end, robot.captured = end, captured
+        if self.now >= self.measured_from:
+            robot.delays.append(robot.executed - row if has_row else math.inf)
 
     def check_all_answered(self) -> None:
         """Check that no request is lost, and that no simulation waits forever beside robots without
@@ -328,7 +372,7 @@ class World:
         if any(robot.plan.need is not None for robot in self.robots):
             return
         # Every second batch has a slot for a simulation that has waited for long.
-        longest_batch_s = self.costs.cost_s(LARGEST) * (1 + self.jitter)
+        longest_batch_s = self.costs.cost_s(self.largest) * (1 + self.jitter)
         bound_s = PATIENCE_S + 2 * (len(self.simulations) + 1) * longest_batch_s
         for simulation in self.simulations:
             assert simulation.longest_s <= bound_s, f"{simulation.name} waited for too long"
@@ -336,6 +380,10 @@ class World:
     def in_time(self) -> int:
         """Return the robots of which at least 98 % of the ticks had an action."""
         return sum(robot.share_in_time() >= 0.98 for robot in self.robots)
+
+    def success(self, curve: SuccessCurve) -> FleetSuccess:
+        """Return the number of successful robots, and the tasks per GPU-hour."""
+        return FleetSuccess.from_robots([robot.served() for robot in self.robots], curve)
 
     def share(self) -> float:
         """Return the lowest share in time of all robots."""
@@ -356,7 +404,13 @@ def fleet(number: int, *kinds: tuple[int, float]) -> list[Robot]:
 
 
 def play(
-    costs: CostCurve, number: int, slack: bool, *kinds: tuple[int, float], obeys: bool = True
+    costs: CostCurve,
+    number: int,
+    slack: bool,
+    *kinds: tuple[int, float],
+    obeys: bool = True,
+    stops: bool = False,
+    batch: int = LARGEST,
 ) -> World:
     """Run a fleet for long enough to settle.
 
@@ -366,12 +420,14 @@ def play(
         slack: Whether the queue uses the slack of the robots.
         kinds: The kinds of robots, which take turns: rows of a chunk, and Hz.
         obeys: Whether the robots replan at the requested pace.
+        stops: Whether the robots wait for each chunk.
+        batch: The maximum size of a batch.
     """
     longest_s = max(rows / hz for rows, hz in kinds)
     robots = fleet(number, *kinds)
     for robot in robots:
-        robot.obeys = obeys
-    world = World(costs, robots, seed=number, slack=slack)
+        robot.obeys, robot.stops = obeys, stops
+    world = World(costs, robots, seed=number, slack=slack, largest=batch)
     world.measured_from = 4 * longest_s + 2
     # With a shorter measurement, a robot with only two late ticks would have less than 98 % in
     # time.
@@ -382,10 +438,16 @@ def play(
 def largest(costs: CostCurve, slack: bool, *kinds: tuple[int, float], obeys: bool = True) -> int:
     """Return the largest fleet in which 98 % of each robot's ticks have an action."""
 
-    def fits(number: int) -> bool:
-        return play(costs, number, slack, *kinds, obeys=obeys).share() >= 0.98
+    return largest_that(
+        lambda number: play(costs, number, slack, *kinds, obeys=obeys).share() >= 0.98
+    )
 
-    low, high = 0, 2
+
+def largest_that(fits: Callable[[int], bool]) -> int:
+    """Return the size of the largest fleet that fits, to within 1 %; 0 if not even one robot
+    does.
+    """
+    low, high = 0, 1
     while fits(high):
         low, high = high, 2 * high
     while high - low > max(1, low // 100):
@@ -445,6 +507,71 @@ def print_fleets() -> None:
                 world = play(PI0, number, slack, *kinds, obeys=obeys)
                 in_time.append(f"{world.in_time()} of {number}")
             print(f"{name:14} {way:15} {most[way]:7}  {', '.join(in_time)}", flush=True)
+
+
+@dataclass(frozen=True)
+class System:
+    """A server, and the loop of its robots."""
+
+    slack: bool  # whether the server uses the slack of the robots
+    stops: bool  # whether robots wait for each chunk
+    batch: int  # maximum size of a batch
+
+    def play(self, number: int, *kinds: tuple[int, float]) -> World:
+        """Run a fleet."""
+        return play(PI0, number, self.slack, *kinds, stops=self.stops, batch=self.batch)
+
+    def largest(self, curve: SuccessCurve, *kinds: tuple[int, float]) -> int:
+        """Return the largest fleet of which each robot is successful."""
+        return largest_that(
+            lambda number: self.play(number, *kinds).success(curve).successful == number
+        )
+
+
+SYSTEMS = {
+    "this server, chunk player": System(slack=True, stops=False, batch=LARGEST),
+    "batches by arrival, chunk player": System(slack=False, stops=False, batch=LARGEST),
+    "one request at a time, chunk player": System(slack=False, stops=False, batch=1),
+    "this server, waiting loop": System(slack=True, stops=True, batch=LARGEST),
+    "batches by arrival, waiting loop": System(slack=False, stops=True, batch=LARGEST),
+    "one request at a time, waiting loop": System(slack=False, stops=True, batch=1),
+}
+"""Plain Ray Serve computes batches in the order of arrival. The servers of openpi and vlagents
+compute one request at a time, and their loops wait for each chunk.
+"""
+
+
+def print_successful(checkpoint: Path) -> None:
+    """Print the largest fleets of successful robots and their tasks per GPU-hour, and those of
+    fleets whose sizes are shares of this server's largest fleet.
+
+    Raises:
+        ConfigError: The success of the checkpoint was not measured.
+    """
+    curves: dict[bool, SuccessCurve] = {}
+    for stops, loop in ((False, "player"), (True, "waiting")):
+        curve = curve_of(checkpoint, loop)
+        if curve is None:
+            raise ConfigError(
+                f"{checkpoint}: expected its success with the loop {loop!r}, got none; measure it "
+                "with `python -m benchmarks.success`"
+            )
+        curves[stops] = curve
+        print(f"{loop}: tolerated delay {curve.tolerated} rows; {curve.mode}, {curve.settings}")
+    print("rows  system  largest successful fleet: tasks per GPU-hour | the same of 70 %, 105 %")
+    for rows in (8, 50):
+        most = 0
+        for name, system in SYSTEMS.items():
+            kind, curve = (rows, 10.0), curves[system.stops]
+            number = system.largest(curve, kind)
+            most = most or number
+            tasks = system.play(number, kind).success(curve).tasks_per_gpu_hour if number else 0.0
+            texts = []
+            for share in (0.7, 1.05):
+                size = round(share * most)
+                success = system.play(size, kind).success(curve)
+                texts.append(f"{success.successful} of {size}: {success.tasks_per_gpu_hour:.0f}")
+            print(f"{rows:4}  {name:36} {number:4}: {tasks:.0f} | {', '.join(texts)}", flush=True)
 
 
 @dataclass(frozen=True)
@@ -612,9 +739,21 @@ def main() -> None:
     parser.add_argument(
         "--others", action="store_true", help="with --beside: also robots that send no slack"
     )
+    parser.add_argument(
+        "--successful", action="store_true", help="print the largest fleets of successful robots"
+    )
+    parser.add_argument(
+        "--checkpoint",
+        type=Path,
+        default=CHECKPOINT,
+        help="the checkpoint whose success is assumed",
+    )
     options = parser.parse_args()
     if options.beside:
         print_beside(options.first, options.seeds, options.others)
+        return
+    if options.successful:
+        print_successful(options.checkpoint)
         return
 
     began = time.monotonic()

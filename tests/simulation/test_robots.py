@@ -7,12 +7,15 @@ of robots in time.
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from tests.simulation.robots import (
     GRAPHS,
     PI0,
     SMALL,
+    SYSTEMS,
     WAYS,
     Robot,
     World,
@@ -23,6 +26,7 @@ from tests.simulation.robots import (
     start_at_once,
 )
 from vlagents_ray.serve.queue.robots_load import CostCurve
+from vlagents_ray.success import Solved, SuccessCurve
 
 
 @pytest.mark.slow
@@ -174,3 +178,53 @@ def test_robots_of_the_oldest_episodes_are_in_time_where_there_are_too_many() ->
     assert world.robots[:80] == first[:80], "the robots began in this order"
     assert sum(robot.starved <= 0.02 * robot.ticks for robot in first) >= 0.9 * len(first)
     assert min(robot.ticks - robot.starved for robot in world.robots) > 0, "each robot gets actions"
+
+
+CURVE = SuccessCurve(
+    "tabletop", 20.0, "async", {}, {0: Solved(500, 500, 25.0), 3: Solved(490, 500, 30.0)}
+)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("rows", [8, 50])
+def test_the_delay_of_an_answer_is_the_time_for_which_a_moving_robot_waits_for_it(
+    name: str, rows: int
+) -> None:
+    """A lone robot is answered after one batch and two ways of the network: within one tick."""
+    robot = SYSTEMS[name].play(1, (rows, 10.0)).robots[0]
+    assert set(robot.delays) == {0 if SYSTEMS[name].stops else 1}
+    assert sum(robot.waits) == pytest.approx(0)
+    assert robot.starved == 0
+    assert robot.served().is_successful(CURVE)
+
+
+def test_a_loop_waits_for_the_batches_before_its_own() -> None:
+    costs = CostCurve(0.3, 0.0)
+    robot = Robot("waits", 10.0, 8, stops=True)
+    world = World(costs, [robot], jitter=0.0).run(30.0)
+    # 0.3 s and 4 ms, of which one tick belongs to the last row of the chunk before.
+    assert {round(wait, 6) for wait in robot.waits} == {2.04}
+    assert robot.ticks == 8 * len(robot.waits)
+    assert robot.served().ticks == pytest.approx(10.04 * len(robot.waits))
+    assert world.success(CURVE).successful == 1
+    moving = 8 / 10.04
+    assert world.success(CURVE).tasks_per_gpu_hour == pytest.approx(moving / 25 * 36_000)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("number", [3, 60])
+def test_the_figures_of_a_fleet_are_those_of_a_direct_count(name: str, number: int) -> None:
+    world = SYSTEMS[name].play(number, (8, 10.0))
+    successful, tasks = 0, 0.0
+    for robot in world.robots:
+        executed = [delay for delay in robot.delays if delay < math.inf]
+        within = sum(delay <= 3 for delay in executed)
+        ticks = robot.ticks + sum(robot.waits)
+        late = robot.starved + sum(wait - 3 for wait in robot.waits if wait > 3)
+        if executed and within >= 0.98 * len(robot.delays) and late <= 0.02 * ticks:
+            successful += 1
+        moved = robot.ticks - robot.starved
+        rates = [CURVE.tasks_per_hour(delay) / 2 for delay in executed]  # 10 Hz in place of 20
+        tasks += moved / ticks * sum(rates) / len(rates) if rates else 0.0
+    assert world.success(CURVE).successful == successful
+    assert world.success(CURVE).tasks_per_gpu_hour == pytest.approx(tasks)
