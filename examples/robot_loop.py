@@ -13,7 +13,8 @@ chunks, modes and safe actions.
 
 import sys
 
-from vlagents_ray import ChunkPlayer, PlayerSettings, RemoteAgent
+from vlagents_ray import ChunkPlayer, RemoteAgent
+from vlagents_ray.chunking.choice import choose_for
 from vlagents_ray.robot import Guard, Watchdog, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 
@@ -33,9 +34,10 @@ def main(url):
     # The watchdog stops the arm when an answer is overdue by 1 s, or the loop has not ticked for
     # 0.2 s.
     watchdog = Watchdog(lambda _reason: arm.stop(), {"server": 1.0, "loop": 0.2})
-    # In "async", the next chunk is requested while the current chunk is executed, so that no tick
-    # waits for the network.
-    with ChunkPlayer(agent, PlayerSettings(mode="async", safe="hold"), check=guard) as player:
+    # This policy does not declare whether its actions are relative, so the arm stops and waits.
+    choice = choose_for(agent, hz=50, safe="hold")
+    print(choice.line)
+    with ChunkPlayer(agent, choice.settings, check=guard) as player:
         report = run_loop(
             arm, player, hz=50, seconds=2, instruction="stack the cups", watchdog=watchdog
         )

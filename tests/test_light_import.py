@@ -23,6 +23,7 @@ FILES = (
         "naming",
         "registry",
         "settings",
+        "success",
         "validation",
     ),
     *("ray_tools/session", "ray_tools/private", "ray_tools/reaper"),

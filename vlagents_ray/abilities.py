@@ -37,6 +37,7 @@ from typing import (
 import numpy as np
 
 from vlagents_ray.interface import Agent, Obs
+from vlagents_ray.success import SuccessCurve
 
 __all__ = [
     "BeginsWithPlan",
@@ -47,6 +48,7 @@ __all__ = [
     "HasCheck",
     "HasControl",
     "HasStatistics",
+    "HasSuccess",
     "HasWeightsId",
     "InProcess",
     "Interruptible",
@@ -242,6 +244,19 @@ class HasStatistics(Protocol):
     They are in the robot's units; None stands for an unknown number. "parts" lists the parts of the
     state in order. A server returns the ranges in its metadata, under `weights`, and `vlagents-ray
     robot` compares them with the robot before its first motion.
+    """
+
+
+# ----- Abilities of an agent that stands for a served policy, such as `RemoteAgent`.
+
+
+@runtime_checkable
+class HasSuccess(InProcess, Protocol):
+    """The agent has the measured success of its policy's checkpoint."""
+
+    success_curves: Sequence[SuccessCurve]
+    """The curves in the folder of the checkpoint; empty if there are none, or if they were measured
+    with other weights or without the policy's wrappers.
     """
 
 

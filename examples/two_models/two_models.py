@@ -24,10 +24,10 @@ from vlagents_ray import (
     Agent,
     ChunkPlayer,
     Contract,
-    PlayerSettings,
     RemoteAgent,
     StateSpec,
 )
+from vlagents_ray.chunking.choice import choose_for
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.robot import run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
@@ -138,7 +138,7 @@ def main(url):
     """Perform the task, and print the result."""
     planner = RemoteAgent(f"{url}/planner", timeout_s=5)
     policy = RemoteAgent(f"{url}/policy", timeout_s=5)
-    player = ChunkPlayer(policy, PlayerSettings(mode="async"))
+    player = ChunkPlayer(policy, choose_for(policy, hz=10).settings)
     with player, GuidedArm(planner) as arm:
         report = run_loop(arm, player, hz=10, seconds=40, until=lambda: arm.answer.done)
     print(f"{TASK}: {'done' if arm.answer.done else 'not done'}")

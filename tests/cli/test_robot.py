@@ -36,6 +36,7 @@ from vlagents_ray.contract import StateSpec
 from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.robot import Watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray.success import Solved, SuccessCurve
 
 MAIN = "from vlagents_ray.cli import main; main()"
 REPEATS = 20  # number of repeats, during which the loop has ten ticks
@@ -366,6 +367,7 @@ class Served(Agent):
 
     transport = "local"
     contract: Contract | None = Contract(action=ActionSpec(dim=2, delta=False), chunk=1)  # type: ignore[assignment]
+    success_curves: tuple[SuccessCurve, ...] = ()
     slow_s = 0.0
     tick = 0
 
@@ -446,6 +448,54 @@ def test_the_simulated_robot_takes_actions_of_which_nothing_is_stated(
     assert drive(["http://nowhere", "--seconds", "0.3", "--hz", "10"]) in (0, 1, 3)
 
 
+CURVE = SuccessCurve(
+    "tabletop", 20.0, "async", {"execute": 4}, {0: Solved(99, 100, 25), 3: Solved(95, 100, 28)}
+)
+DECLARED = Contract(action=ActionSpec(dim=2, delta=False), chunk=8)
+
+
+@pytest.mark.parametrize(
+    ("words", "attributes", "line"),
+    [
+        (
+            [],
+            {"contract": DECLARED, "success_curves": (CURVE,)},
+            r"mode async: the contract declares absolute actions; measured: 95 % of 100 at 3 rows,",
+        ),
+        (
+            [],
+            {"contract": Contract(action=ActionSpec(dim=2), chunk=8)},
+            r"mode open_loop, which executes 4 of 8 rows .*: the contract does not .*; no measured",
+        ),
+        (
+            [],
+            {"contract": DECLARED, "slow_s": 0.5},
+            r"mode open_loop, .*: \d+ rows of delay \(\d+ ms\) is more than half of a chunk of 8 ",
+        ),
+        (["--mode", "ensemble"], {"contract": DECLARED}, r"mode ensemble: as set; no measured"),
+    ],
+    ids=["measured", "undeclared", "late", "explicit"],
+)
+def test_the_command_names_the_mode_its_reason_and_the_measured_success(
+    served: Callable[..., None],
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    attributes: dict[str, Any],
+    line: str,
+) -> None:
+    slow_s = attributes.get("slow_s", 0.0)  # at 10 Hz five rows, or a part of one
+
+    def act(_: Agent, obs: Obs) -> Act:
+        time.sleep(slow_s)
+        return Act(np.zeros((8, 2), np.float32))
+
+    served(act=act, **attributes)
+    drive(["http://nowhere", "--hz", "10", "--seconds", "0.1", *words])
+    lines = [text for text in capsys.readouterr().out.splitlines() if text.startswith("mode ")]
+    assert len(lines) == 1
+    assert re.match(line, lines[0]), lines
+
+
 def test_a_run_of_safe_actions_does_not_look_like_success(
     served: Callable[..., None],
     capsys: pytest.CaptureFixture[str],
@@ -453,7 +503,7 @@ def test_a_run_of_safe_actions_does_not_look_like_success(
 ) -> None:
     served(slow_s=0.3)
     for _ in range(ATTEMPTS):  # on a busy machine the run may have hardly any ticks
-        status = drive(SHORT)
+        status = drive([*SHORT, "--mode", "async"])
         said = capsys.readouterr()
         if status == 3:
             break
@@ -681,7 +731,7 @@ class Slow(Still):
 
     def act(self, obs):
         Slow.answers += 1
-        if Slow.answers == 3:
+        if Slow.answers == 10:  # after the command has measured the delay
             time.sleep(1.0)
         return super().act(obs)
 
@@ -935,8 +985,8 @@ OPTIONS: dict[str, list[str] | None] = {
     "--mode": ["ensemble"],
     "--execute": ["2"],
     "--horizon": ["4"],
-    "--merge": ["average"],
-    "--rtc": [],
+    "--merge": ["average", "--mode", "async"],
+    "--rtc": ["--mode", "async"],
     "--max-age-s": ["5"],
     "--deadline-ms": ["500"],
     "--safe": ["hold"],

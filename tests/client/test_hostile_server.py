@@ -18,6 +18,7 @@ import pytest
 from websockets.exceptions import InvalidHandshake
 
 from vlagents_ray import Act, Obs, RemoteAgent, VLAgentsError
+from vlagents_ray.chunking.choice import choose_for
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.websocket import ProxiedSocket
 from vlagents_ray.errors import BY_CODE
@@ -36,7 +37,21 @@ METADATA: dict[str, Any] = {
     "longest_prefix": 0,
     "local": None,
     "stream": None,
-    "weights": {"digest": "d", "statistics": {"state": {"min": [0.0], "max": [1.0]}}},
+    "weights": {
+        "digest": "d",
+        "statistics": {"state": {"min": [0.0], "max": [1.0]}},
+        "success": [
+            {
+                "env": "tabletop",
+                "hz": 20.0,
+                "mode": "async",
+                "settings": {"execute": 4},
+                "weights": "d",
+                "delays": [{"rows": 0, "solved": 9, "episodes": 10, "ticks": 25.0}],
+            }
+        ],
+    },
+    "policy_version": {"newest": {"version": 0, "fingerprint": "f"}},
 }
 ADDRESSES = {
     "local": {"socket": "vlagents-ray-none", "boot_id": "another machine", "keyed": False},
@@ -249,6 +264,7 @@ def act_once(url: str, transport: str = "http") -> Act:
         url, transport=transport, timeout_s=TIME_LIMIT_S, connect_timeout_s=TIME_LIMIT_S
     ) as agent:
         agent.initialize()
+        choose_for(agent, hz=20.0, delay_s=0.0)
         agent.reset(Obs(), "x")
         return agent.act(Obs())
 
@@ -256,6 +272,20 @@ def act_once(url: str, transport: str = "http") -> Act:
 def test_the_honest_server_of_these_tests_is_understood() -> None:
     with http_policy(METADATA, GOOD_REPLY) as url:
         assert act_once(url).action.shape == (7,)
+        with RemoteAgent(url, transport="http") as agent:
+            [curve] = agent.success_curves
+    assert curve.to_json() == METADATA["weights"]["success"][0]
+
+
+@pytest.mark.parametrize("version", ["newest", "pinned"])
+def test_a_checkpoint_whose_weights_were_replaced_has_no_measured_success(version: str) -> None:
+    replaced_version = {version: {"version": 1, "fingerprint": "g"}}
+    versions = METADATA["policy_version"] | replaced_version
+    with (
+        http_policy(METADATA | {"policy_version": versions}, GOOD_REPLY) as url,
+        RemoteAgent(url, transport="http") as agent,
+    ):
+        assert not agent.success_curves
 
 
 @pytest.mark.slow

@@ -13,12 +13,15 @@ from eval_fakes import LINE
 from in_process_evaluation import flat_config
 from in_process_replicas import Replicas
 
+from vlagents_ray.abilities import BeginsWithPlan, HasSuccess, ability
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ContractMismatch
 from vlagents_ray.evaluate import Summary, evaluate
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.local_agent import LocalPolicy, policy_metadata
+from vlagents_ray.success import Solved, SuccessCurve, write_curves
 
 THIS = f"{__name__}:Trembling"
 
@@ -94,6 +97,27 @@ def test_its_episodes_are_those_of_a_replica(
     assert {one["status"] for one in here} == {"done", "policy_error"}
     described = found[0].results.policies["policy"]
     assert (described["policy"], described["config"]) == (THIS, {"length": 0.8})
+
+
+def test_it_has_the_abilities_that_the_choice_of_a_mode_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    curve = SuccessCurve("line", 10.0, "async", {}, {0: Solved(9, 10, 25.0)})
+    write_curves(tmp_path, [curve])
+    (tmp_path / "weights.pt").write_bytes(b"1")
+    monkeypatch.setattr(
+        Beginning, "initialize", lambda _: find_checkpoint(str(tmp_path / "weights.pt"))
+    )
+    agent = LocalPolicy(ServerArgs(policy=f"{__name__}:Beginning"), {})
+    agent.initialize()
+    try:
+        prefixes, success = ability(agent, BeginsWithPlan), ability(agent, HasSuccess)
+        assert prefixes is not None
+        assert prefixes.longest_prefix == 3
+        assert success is not None
+        assert [*success.success_curves] == [curve]
+    finally:
+        agent.close()
 
 
 def test_the_contract_of_the_environment_is_compared_first() -> None:

@@ -23,9 +23,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
 
-from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
+from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
+from vlagents_ray.chunking.choice import WAIT_S, Choice, ChosenMode, choose_for, measured_delay
 from vlagents_ray.chunking.control import RobotControl
-from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
+from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.chunking.timeliness import in_words
 from vlagents_ray.cli.arguments import CommandParser, number, one_of, parse_all
 from vlagents_ray.cli.examples import EXAMPLES
@@ -63,8 +64,6 @@ from vlagents_ray.viewers import open_viewer
 
 logger = logging.getLogger(__name__)
 MOSTLY_SAFE = 3  # exit status
-# Deadline of a tick, s, in the modes that wait for an answer: half of the default of --silent-s.
-WAIT_S = 1.0
 _HZ = 50.0  # default control rate of a robot
 _MOST_HZ = 10_000.0  # maximum control rate; no arm and no loop in Python is faster
 _LABELS = {"y": "success", "n": "failure"}
@@ -148,7 +147,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         )
 
     if options.mode is None:
-        options.mode = "open_loop" if in_env else "async"
+        # A simulation stands still while it waits for its policy.
+        options.mode = "open_loop" if in_env else "auto"
     if options.mode != "async" and (options.merge != "newest" or options.rtc):
         parser.error(
             f"--merge and --rtc: expected --mode async with them, got --mode {options.mode}"
@@ -188,16 +188,18 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if open_leader is not None:
             leader = stack.enter_context(_opened_leader(open_leader, options, contract, say))
 
-        deadline_s = _deadline_s(options)
-        settings = _player_settings(options, contract, deadline_s)
         guard = _guard(options, contract, hz)
-        player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
-        player.initialize()  # raises for unsuitable settings before the robot moves
-
         make_robot = make_robot or partial(SimulatedRobot, contract)
         robot = stack.enter_context(opened(make_robot))
         _require_measure(options.measure, contract, robot, say)
-        fit = _require_fit(options, agent, robot, guard.limits, say)
+        fit, delay_s = _require_fit(options, agent, robot, guard.limits, say)
+
+        choice = _choice(options, agent, hz, delay_s)
+        say(choice.line)
+        logger.info("%s", choice.line)
+        settings = choice.settings
+        player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
+        player.initialize()  # raises for unsuitable settings before the robot moves
 
         recorder = None
         if options.record:
@@ -208,7 +210,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if options.rerun is not None:
             viewer = stack.enter_context(open_viewer(options.rerun))
 
-        hanging_s = max(0.2, 5 / hz) + deadline_s
+        hanging_s = max(0.2, 5 / hz) + (settings.deadline_s or 0.0)
         limits_s = {"server": options.silent_s, "loop": hanging_s}
         keys = _RunKeys(recorder, say)
         watchdog = stack.enter_context(_watched(robot, limits_s, keys, say))
@@ -240,7 +242,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         except BaseException as error:  # noqa: BLE001 - raised again after the report
             failure = error
 
-        _say_report(report, f"{options.mode}, {agent.transport}", say, led=leader is not None)
+        _say_report(report, f"{choice.mode}, {agent.transport}", say, led=leader is not None)
 
     if recorder is not None:  # the recorder is closed, so that all frames are written
         say(
@@ -311,31 +313,30 @@ def _guard(options: argparse.Namespace, contract: Contract | None, hz: float) ->
     )
 
 
-def _deadline_s(options: argparse.Namespace) -> float:
-    """Return how long a tick waits for an action, s."""
-    if options.deadline_ms is not None:
-        return float(options.deadline_ms / 1e3)
-    return 0.0 if options.mode == "async" else WAIT_S
-
-
-def _player_settings(
-    options: argparse.Namespace, contract: Contract | None, deadline_s: float
-) -> PlayerSettings:
-    """Return the settings of the chunk player for a policy with this contract."""
+def _choice(
+    options: argparse.Namespace, agent: RemoteAgent, hz: float, delay_s: float | None
+) -> Choice:
+    """Return the mode and the settings of the chunk player for a policy, whose answers take
+    `delay_s` as far as this is known.
+    """
+    contract = agent.contract
     safe = options.safe
     is_relative_known = contract is not None and contract.action.relative is not None
     if safe == "auto" and not options.robot and not is_relative_known:
         # The simulated robot uses actions without a declared type as absolute targets.
         safe = "hold"
 
-    return PlayerSettings(
-        options.mode,
-        options.execute,
+    return choose_for(
+        agent,
+        mode=options.mode,
+        hz=hz,
+        delay_s=delay_s,
+        execute=options.execute,
         merge=options.merge,
         horizon=options.horizon,
         safe=safe,
         max_age_s=options.max_age_s,
-        deadline_s=deadline_s,
+        deadline_s=None if options.deadline_ms is None else options.deadline_ms / 1e3,
         real_time_chunking=options.rtc,
     )
 
@@ -420,9 +421,12 @@ def _require_fit(
     robot: Robot,
     limits: MotionLimits | None,
     say: Callable[[str], None],
-) -> Fit:
+) -> tuple[Fit, float | None]:
     """Compare the policy's first chunk with the training data of the checkpoint and the limits of
-    the arm, and print all three.
+    the arm, and print all three. Measure the delay of an answer if the mode depends on it.
+
+    Returns:
+        The comparison, and the delay, s; None if it was not measured.
 
     Raises:
         ContractMismatch: They do not fit, and --ignore-mismatch is not given.
@@ -439,15 +443,20 @@ def _require_fit(
         say(message)
         logger.info("%s", message)
 
-    if fit.compares and not (is_default and trained is None):
+    compares = fit.compares and not (is_default and trained is None)
+    delay_s = None
+    if compares or options.mode == "auto":
         obs = robot.observe()
         agent.reset(obs, options.instruction)
-        rows = agent.act(obs).rows()
-        for line in fit.draw(rows):
-            say(line)
-            logger.info("%s", line)
-        fit.require(obs, rows)
-    return fit
+        if options.mode == "auto":
+            delay_s = measured_delay(agent, obs)
+        if compares:
+            rows = agent.act(obs).rows()
+            for line in fit.draw(rows):
+                say(line)
+                logger.info("%s", line)
+            fit.require(obs, rows)
+    return fit, delay_s
 
 
 def _say_report(report: LoopReport, name: str, say: Callable[[str], None], *, led: bool) -> None:
@@ -812,9 +821,10 @@ def _add_chunk_options(options: _Options) -> None:
     options.begin("Action chunks", "With --env, only --mode and --execute apply.")
     options.both(
         "--mode",
-        **one_of(*get_args(Mode)),
+        **one_of(*get_args(ChosenMode)),
         help="Mode that determines when the next chunk is requested and how chunks are executed, "
-        "see docs/control_loop.md; default: async, with --env open_loop.",
+        "see docs/control_loop.md. auto chooses it from the policy's contract and its measured "
+        "success; default: auto, with --env open_loop.",
     )
     options.both(
         "--execute",

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 import typer
 
 from vlagents_ray.abilities import HasControl, ability
+from vlagents_ray.chunking.choice import choose_for
 from vlagents_ray.chunking.control import Leader, RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.chunking.timeliness import in_words
@@ -138,7 +139,7 @@ class RobotRun:
                 hz=hz,
                 soft_start_s=self.options.soft_start_s,
             )
-            agent = stack.enter_context(self._agent(env.contract, leader, guard))
+            agent = stack.enter_context(self._agent(env.contract, leader, guard, hz))
             has_control = ability(agent, HasControl)
             self._control = None if has_control is None else has_control.control
 
@@ -232,7 +233,7 @@ class RobotRun:
             return False
         return True
 
-    def _agent(self, contract: Contract, leader: Leader | None, guard: Guard) -> Agent:
+    def _agent(self, contract: Contract, leader: Leader | None, guard: Guard, hz: float) -> Agent:
         """Build the agent: the operator alone, or a policy that the operator may override."""
         if self.options.policy is None:
             if leader is None:
@@ -256,8 +257,18 @@ class RobotRun:
         policy = EnvPolicy(inner, contract)
         policy.initialize()
         require_match(inner.contract, contract)
-        settings = PlayerSettings(self.options.mode, self.options.execute)
+        settings = self._player_settings(policy, hz)
         return ChunkPlayer(policy, settings, check=guard, override=leader)
+
+    def _player_settings(self, policy: Agent, hz: float) -> PlayerSettings:
+        """Return the settings of the chunk player. In a mode that the options name, the simulation
+        waits for its policy without a time limit.
+        """
+        if self.options.mode != "auto":
+            return PlayerSettings(self.options.mode, self.options.execute)
+        choice = choose_for(policy, hz=hz, execute=self.options.execute)
+        out.print(choice.line)
+        return choice.settings
 
     def _pause(self) -> None:
         """Pause motion, or continue it."""

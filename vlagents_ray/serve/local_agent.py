@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from vlagents_ray.client.agent import curves_in
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
@@ -21,6 +22,7 @@ from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
 from vlagents_ray.serve.sessions import SessionFinder
+from vlagents_ray.success import SuccessCurve
 
 _LOOK_S = 0.1  # period of the checks whether another thread has loaded a checkpoint, s
 
@@ -180,6 +182,18 @@ class LocalPolicy(LocalAgent):
     def metadata(self) -> dict[str, Any]:
         """The metadata of the policy, as `RemoteAgent.metadata`."""
         return policy_metadata(self._args, self.engine, *self._code)
+
+    @property
+    def longest_prefix(self) -> int:
+        """The largest number of rows of the executed plan with which a chunk begins; see
+        `BeginsWithPlan`.
+        """
+        return self.engine.model.longest_prefix
+
+    @property
+    def success_curves(self) -> Sequence[SuccessCurve]:
+        """The measured success of the policy's checkpoint; see `HasSuccess`."""
+        return curves_in(self.metadata)
 
     def initialize(self) -> None:
         self.engine.start()

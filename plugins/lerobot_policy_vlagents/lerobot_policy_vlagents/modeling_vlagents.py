@@ -128,8 +128,7 @@ class VlagentsPolicy(PreTrainedPolicy):
                 "executed, so that its chunks would not fit together, got rtc; use "
                 "--inference.type=sync, serve a policy with real-time chunking and `actions: "
                 "chunk` (pi0, openpi, or smolvla, pi0 and pi05 of lerobot), or, to keep the robot "
-                "moving while another policy computes, drive it with vlagents_ray's own "
-                "ChunkPlayer(agent, mode='async')"
+                "moving while another policy computes, drive it with `vlagents-ray robot`"
             )
         return True
 

@@ -24,6 +24,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.checkpoint_files import digest
+from vlagents_ray.policies.wrapper import Wrapper
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -33,6 +34,7 @@ from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.sessions import Session
 from vlagents_ray.serve.weights import Rest
+from vlagents_ray.success import SUCCESS_FILE, Solved, SuccessCurve, write_curves
 
 
 @pytest.fixture
@@ -426,6 +428,41 @@ def test_the_statistics_of_the_training_are_in_the_metadata_of_the_weights(
         assert reply.info.get("weights") == expected["digest"]
     finally:
         engine.close()
+
+
+def curve(weights: str | None) -> SuccessCurve:
+    return SuccessCurve("tabletop", 20.0, "async", {}, {0: Solved(9, 10, 25.0)}, weights)
+
+
+class Renamed(Wrapper):
+    """A wrapper that changes nothing."""
+
+
+def test_the_measured_success_of_a_checkpoint_is_in_the_metadata_of_its_weights(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "weights.pt"
+    file.write_bytes(b"1")
+    own = digest([file])
+
+    def success(agent: Agent) -> Any:
+        engine = Engine(agent)
+        engine.start()
+        try:
+            return (engine.model.weights or {}).get("success")
+        finally:
+            engine.close()
+
+    assert success(Stored(file)) is None
+    write_curves(tmp_path, [curve(own), curve(None), curve("sampled-sha256:other")])
+    assert success(Stored(file)) == [curve(own).to_json(), curve(None).to_json()]
+    assert success(Stored(file, {"digest": "mine", "revision": None})) == [curve(None).to_json()]
+    assert success(Renamed(Stored(file))) is None, "a wrapper may change the actions"
+
+    # A file of the same name with other contents does not prevent that the policy is served.
+    (tmp_path / SUCCESS_FILE).write_text("[]")
+    assert success(Stored(file)) is None
+    assert "measure them again" in caplog.text
 
 
 def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Path) -> None:

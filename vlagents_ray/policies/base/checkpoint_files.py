@@ -11,6 +11,7 @@ import fnmatch
 import hashlib
 import itertools
 import json
+import logging
 import os
 import re
 import zipfile
@@ -19,8 +20,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from vlagents_ray.abilities import HasWeightsId, ability
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
-from vlagents_ray.success import SUCCESS_FILE
+from vlagents_ray.success import SUCCESS_FILE, read_curves
+
+logger = logging.getLogger(__name__)
 
 # Names that training programs use for unfinished files: the folders of orbax, and the usual
 # suffixes.
@@ -167,6 +171,26 @@ def identify_weights(agent: Agent, paths: Sequence[Path]) -> dict[str, Any] | No
     """
     has_id = ability(agent, HasWeightsId)
     return (has_id.weights_id if has_id is not None else None) or weights_of(paths)
+
+
+def success_of(paths: Sequence[Path], digest: str | None) -> list[dict[str, Any]]:
+    """Return the measured success of a policy's checkpoint as JSON, for the metadata.
+
+    Curves of other weights are left out, such as curves of the base of an adapter. A file that
+    cannot be read is logged and left out: the policy does not depend on it.
+
+    Args:
+        paths: The files and folders that the policy found; the first one is its checkpoint.
+        digest: The digest of the loaded weights.
+    """
+    if not paths:
+        return []
+    try:
+        curves = read_curves(paths[0] if paths[0].is_dir() else paths[0].parent)
+    except ConfigError as error:
+        logger.warning("%s", error)
+        return []
+    return [curve.to_json() for curve in curves if curve.weights in (None, digest)]
 
 
 def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:

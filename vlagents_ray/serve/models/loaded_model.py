@@ -26,7 +26,7 @@ from vlagents_ray.policies.base.checkpoint import (
     resolved,
     used_checkpoints,
 )
-from vlagents_ray.policies.base.checkpoint_files import identify_weights
+from vlagents_ray.policies.base.checkpoint_files import identify_weights, success_of
 from vlagents_ray.policies.base.program import Program, digest_of, files_named, with_defaults
 from vlagents_ray.policies.loading import LoadingReport, loading_report
 from vlagents_ray.policies.wrapper import unwrapped
@@ -128,7 +128,8 @@ class LoadedModel:
     contract: Contract | None
     copies: AgentCopies
     padding: Padding
-    # Digest and revision of the weights (see `HasWeightsId`), and statistics (see `HasStatistics`).
+    # Digest and revision of the weights (see `HasWeightsId`), statistics (see `HasStatistics`), and
+    # curves of success as JSON (see `HasSuccess`).
     weights: dict[str, Any] | None
     files: Program  # digests of the files named in the settings
     # Equal in replicas that can take over each other's sessions of this model.
@@ -339,6 +340,13 @@ class Loader:
                     **(weights or {}),
                     "statistics": trained_on.statistics,
                 }
+
+            # A wrapper changes the actions, so that the checkpoint's success is not the policy's.
+            curves: list[dict[str, Any]] = []
+            if weights is not None and unwrapped(agent) is agent:
+                curves = success_of(checkpoints, weights["digest"])
+            if weights is not None and curves:
+                weights = {**weights, "success": curves}
 
             contract = agent.contract
             self._check(contract)

@@ -155,7 +155,9 @@ class ServedModel:
 
     @property
     def weights(self) -> dict[str, Any] | None:
-        """Digest, revision and statistics of the loaded weights, see `LoadedModel.weights`."""
+        """Digest, revision, statistics and measured success of the loaded weights, see
+        `LoadedModel.weights`.
+        """
         model = self._loaded
         return None if model is None else model.weights
 
