@@ -3,9 +3,9 @@ success.
 
 The reference policy runs the same seeds of the tabletop with each setting: eager and without Ray,
 which is the standard; compiled, in bfloat16, in 8 bits; in batches; over each transport; with JPEG;
-with each mode of executing chunks, at several delays; with a LoRA adapter; after a push;
-behind `upstream` with each protocol. A paired test (McNemar, adjusted by Holm for all settings)
-compares each setting with the standard. The actions of each episode are also compared bit by bit.
+with averaged chunks; with a LoRA adapter; after a push; behind `upstream` with each protocol. A
+paired test (McNemar, adjusted by Holm for all settings) compares each setting with the standard.
+The actions of each episode are also compared bit by bit. `benchmarks.delays` measures late answers.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from vlagents_ray.cli.console import errors, out, table
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError, MissingDependency, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SuiteConfig, evaluate
-from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.results.statistics import (
     Pairs,
     difference_interval,
@@ -55,14 +54,6 @@ APP = "reference"
 CHUNK, EXECUTE = 8, 4  # number of rows of a chunk, and number of executed rows
 TOGETHER = 16  # number of episodes of a batch
 QUALITIES = (30, 50, 70, 85, 95)  # qualities of JPEG; 85 is the client's default
-DELAYS = (0.0, 0.1, 0.3)  # delays of an answer, s: zero, one and three ticks of the tabletop
-# The actions that are executed during the delay: none, the old plan, or the rows that the new plan
-# continues.
-LATE: dict[str, dict[str, Any]] = {
-    "stop and wait": {"meanwhile": "zero"},
-    "async": {},
-    "real-time chunking": {"real_time_chunking": True},
-}
 _RAW = ImageCodec("raw")
 # The layer with an adapter of rank 4 of random weights, small enough that success remains.
 _ADAPTED = "context"
@@ -115,7 +106,6 @@ class Way:
     pushed: bool = False  # whether the server began with other weights
     together: int = 1  # number of episodes that run at the same time
     execute: int = EXECUTE
-    clock: ClockConfig | None = None
     equal: bool = False  # whether actions must be bit-identical to the standard
 
 
@@ -141,11 +131,6 @@ def ways() -> list[Way]:
         *(Way(f"upstream, {name}", upstream=name) for name in PROTOCOLS),
         Way(f"open loop, all {CHUNK} rows", execute=CHUNK),
         Way("ensemble", {"actions": "ensemble"}, execute=1),
-        *(
-            Way(f"{name}, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, **settings))
-            for name, settings in LATE.items()
-            for s in DELAYS
-        ),
         Way("LoRA merged", adapter=True),
     ]
 
@@ -194,7 +179,6 @@ class Players:
             env_options=cameras,
             episodes=self._episodes,
             num_envs=way.together,
-            clock=way.clock,
         )
         policy = PolicyConfig(name=way.name, config=way.config, execute=way.execute)
         place = self._folder / plain(way.name)

@@ -150,10 +150,24 @@ def test_a_started_tick_is_over_and_rounding_starts_none() -> None:
     assert len(played(ChunkExecutor(None, clock(), RELATIVE), 1.1001, CHUNK[:1])) == 12 + 1
 
 
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=5), st.integers(1, 12))
+def test_answers_have_the_latencies_of_a_list_in_turn(delays: list[int], answers: int) -> None:
+    latencies_s = [delay / 10 for delay in delays]
+    varying = ChunkExecutor(4, clock(latency=latencies_s), RELATIVE)
+    constant = ChunkExecutor(4, clock(), RELATIVE)
+    for number in range(answers):
+        latency_s = varying.latency_s(9.0)
+        assert latency_s == latencies_s[number % len(latencies_s)]
+        assert played(varying, latency_s) == played(constant, latency_s)
+
+
 def test_what_a_clock_lacks_is_named() -> None:
     with pytest.raises(ConfigError, match=r"give clock\.neutral"):
         ChunkExecutor(None, clock(), ABSOLUTE)
-    ChunkExecutor(None, clock(latency=0), ABSOLUTE)
+    with pytest.raises(ConfigError, match=r"give clock\.neutral"):
+        ChunkExecutor(None, clock(latency=[0.0, 0.1]), ABSOLUTE)
+    for latency in (0, [0.0, 0.0]):
+        ChunkExecutor(None, clock(latency=latency), ABSOLUTE)
     sizeless = Contract(action=replace(ABSOLUTE.action, dim=None), control_hz=10.0)
     with pytest.raises(
         ConfigError, match="expected 2 numbers, as the policy's actions have, got 3"
@@ -199,6 +213,9 @@ def test_no_key_of_a_clock_contradicts_the_contract() -> None:
         {"latency": -1},
         {"latency": float("inf")},
         {"latency": "guessed"},
+        {"latency": []},
+        {"latency": [0.1, -1]},
+        {"latency": [0.1, "measured"]},
         {"meanwhile": "dance"},
         {"hz": 10.0},
     ],

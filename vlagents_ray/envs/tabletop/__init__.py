@@ -63,8 +63,8 @@ class Tabletop(EvalEnv):
     gripper, 1 = open, -1 = closed. Values outside [-1, 1] are clipped, as a robot's controller
     does.
 
-    The reward is 1.0 in each step after which the task is solved, and otherwise 0.0. An episode is
-    never terminated.
+    The reward is 1.0 in each step after which the task is solved, and otherwise 0.0. Success ends
+    an episode only with `ends_on_success`.
     """
 
     known = (MIXED, *_TASKS)
@@ -80,6 +80,7 @@ class Tabletop(EvalEnv):
         pucks: int = PUCKS,
         object_state: bool = False,
         disturbance: float = 0.0,
+        ends_on_success: bool = False,
     ) -> None:
         """Create the environment of a task.
 
@@ -96,6 +97,7 @@ class Tabletop(EvalEnv):
             disturbance: Standard deviation of the noise that is added to the motion in a tenth of
                 the steps, in units of an action. Demonstrations with such noise show how to recover
                 from errors (DART, arXiv 1703.09327).
+            ends_on_success: Whether to report `terminated` when the task is solved.
 
         Raises:
             ConfigError: The task is unknown, or a number is out of range.
@@ -113,6 +115,7 @@ class Tabletop(EvalEnv):
 
         self.max_steps, self._disturbance = max_steps, disturbance
         self._pucks, self._object_state = pucks, object_state
+        self._ends_on_success = ends_on_success
         self._contract = self.known_contract(
             {"width": width, "height": height, "cameras": cameras, "object_state": object_state}
         )
@@ -228,7 +231,9 @@ class Tabletop(EvalEnv):
 
         success = goal.is_reached(world)
         obs = self._observe(world, goal, look=self.looked_at)
-        return obs, float(success), False, self._steps >= self.max_steps, {"success": success}
+        terminated = success and self._ends_on_success
+        truncated = self._steps >= self.max_steps
+        return obs, float(success), terminated, truncated, {"success": success}
 
     def close(self) -> None:
         self._world = self._goal = None

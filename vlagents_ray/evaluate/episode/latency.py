@@ -9,6 +9,7 @@ is the case L = 0.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -71,7 +72,10 @@ class ChunkExecutor:
             )
 
         self._spec = env.action
-        if self._clock.latency != 0 and last is None and self._clock.neutral is None:
+        latency = self._clock.latency
+        latencies_s = latency if isinstance(latency, list) else [latency]
+        self._latencies_s = itertools.cycle(latencies_s)
+        if any(latencies_s) and last is None and self._clock.neutral is None:
             dim = env.action.dim
             if dim is None and not env.action.relative:
                 raise _needs_neutral()
@@ -91,7 +95,8 @@ class ChunkExecutor:
         """Return the latency of an answer that took `measured_s`, s; None if there is no clock."""
         if not self._real_time:
             return None
-        return measured_s if self._clock.latency == "measured" else self._clock.latency
+        latency_s = next(self._latencies_s)
+        return measured_s if latency_s == "measured" else latency_s
 
     def request_info(self) -> dict[str, Any]:
         """Return the `Obs.info` for real-time chunking, with the remaining rows; {} if no rows

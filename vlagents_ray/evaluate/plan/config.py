@@ -50,6 +50,10 @@ Seconds = Annotated[float, Field(gt=0, le=MOST_S)]
 Hertz = Annotated[float, Field(gt=0, le=MOST_HZ)]
 
 
+Latency = Annotated[float, Field(ge=0, le=3600)]  # s
+Latencies = Annotated[list[Latency], Field(min_length=1, max_length=MOST_ROWS)]
+
+
 class _PlanModel(BaseModel):
     # Errors are logged, so they must not contain the input.
     model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
@@ -213,10 +217,11 @@ class ClockConfig(_PlanModel):
     `vlagents_ray.evaluate.episode.latency`).
     """
 
-    latency: Literal["measured"] | Annotated[float, Field(ge=0, le=3600)] = Field(
+    latency: Literal["measured"] | Latency | Latencies = Field(
         default="measured",
-        description="Latency of each answer: `measured`, with the transport, or a number of "
-        "seconds, with which an episode is reproducible.",
+        description="Latency of each answer: `measured`, with the transport; or seconds, with "
+        "which an episode is reproducible: a number, or a list, whose numbers the answers of an "
+        "episode have in turn, such as a recorded series.",
     )
     meanwhile: Literal["chunk", "hold", "zero"] = Field(
         default="chunk",
