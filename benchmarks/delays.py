@@ -7,8 +7,7 @@ Each setting is compared with the synchronous episodes of the same seeds, in whi
 waits for the policy. `--curves` writes the curves of success into the folder of a checkpoint, where
 `vlagents-ray serve` finds them.
 
-    python -m benchmarks.delays deployments/reference.yaml --env tabletop \\
-        --env-set 'cameras=["front","wrist"]' --env-set width=64 --env-set height=64
+    python -m benchmarks.delays deployments/my_policy.yaml --env metaworld/drawer-open-v3
 """
 
 from __future__ import annotations
@@ -59,6 +58,8 @@ DELAYS: dict[str, int | tuple[int, ...]] = {
     "1 to 4": VARYING,
     "1, or lost": LOST,
 }
+# Options of the environment of the default, in which the reference policy was trained.
+TABLETOP = ('cameras=["front","wrist"]', "width=64", "height=64", "ends_on_success=true")
 # Window of the moving average in `oscillation_m`: motions that take longer are no oscillations.
 _WINDOW_S = 0.5
 
@@ -358,6 +359,8 @@ def main(
         app = only_application(policy, read_deployment(policy, overrides=overrides))
         agent = LocalPolicy(ServerArgs.model_validate(app.args), own_settings(app))
         agent.initialize()
+        if env == "tabletop" and not env_set:
+            env_set = [*TABLETOP]
         part, options = position or None, parse_settings(env_set, "--env-set")
         measured = Measurement(
             agent, env, options, execute=execute, batch=batch, part=part, folder=folder

@@ -3,7 +3,7 @@
 A robot that always has an action in time can still fail, since each action was computed from an
 observation of the past. `SuccessCurve` contains what was measured for a policy: how many episodes
 were solved at each delay. Delays are in *rows*, which are ticks of the environment's rate, since a
-policy's loss depends on the motion during the delay. `benchmarks.success` measures curves and
+policy's loss depends on the motion during the delay. `benchmarks.delays` measures curves and
 writes them into the file `success.json` in the folder of a checkpoint, and `read_curves` reads
 them.
 """
@@ -231,7 +231,7 @@ def read_curves(folder: Path) -> list[SuccessCurve]:
     except (ValueError, RecursionError) as error:
         raise ConfigError(
             f"{file}: expected curves of success, got an error: {error}; measure them again with "
-            "benchmarks.success, or remove the file"
+            "benchmarks.delays, or remove the file"
         ) from error
 
 

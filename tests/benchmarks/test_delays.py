@@ -92,12 +92,7 @@ def test_it_measures_the_reference_policy_and_writes_its_curves(tmp_path: Path) 
         delays.main(
             "deployments/reference.yaml",
             "tabletop",
-            env_set=[
-                'cameras=["front","wrist"]',
-                "width=64",
-                "height=64",
-                "ends_on_success=true",
-            ],
+            env_set=[],
             settings=[],
             execute=4,
             episodes=2,

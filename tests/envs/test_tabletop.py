@@ -158,6 +158,23 @@ def test_disturbances_follow_from_the_seed_and_the_expert_recovers() -> None:
     assert np.mean([play(env, seed) for seed in range(many(50))]) >= 0.8
 
 
+@pytest.mark.parametrize("ends", [False, True])
+def test_success_ends_an_episode_only_on_request(ends: bool) -> None:
+    env = Tabletop("lift", max_steps=60, ends_on_success=ends)
+    expert = Scripted.from_config({})
+    obs, _ = env.reset(seed=1)
+    expert.reset(obs, env.instruction, env="tabletop/lift")
+    ended = []
+    for _ in range(60):
+        obs, _, terminated, truncated, info = env.step(expert.act(obs))
+        ended.append((terminated, info["success"]))
+        if terminated or truncated:
+            break
+    first = next(number for number, (_, success) in enumerate(ended) if success)
+    assert [terminated for terminated, _ in ended].count(True) == ends
+    assert (len(ended) == first + 1) == ends
+
+
 def test_what_there_is_not_is_refused() -> None:
     elsewhere = "put the orange puck on the blue pad"
     for option, value in (("instruction", elsewhere), ("init_state", "3")):

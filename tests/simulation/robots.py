@@ -554,7 +554,7 @@ def print_successful(checkpoint: Path) -> None:
         if curve is None:
             raise ConfigError(
                 f"{checkpoint}: expected its success with the loop {loop!r}, got none; measure it "
-                "with `python -m benchmarks.success`"
+                "with `python -m benchmarks.delays`"
             )
         curves[stops] = curve
         print(f"{loop}: tolerated delay {curve.tolerated} rows; {curve.mode}, {curve.settings}")
