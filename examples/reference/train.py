@@ -16,7 +16,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +25,7 @@ import torch
 import typer
 from torch.nn.functional import smooth_l1_loss
 
+from vlagents_ray.columns import Columns
 from vlagents_ray.datasets.episode import INTERVENTION_COLUMN
 from vlagents_ray.policies.base.model_inputs import resize_with_pad, state_vector
 from vlagents_ray.policies.reference.checkpoint import (
@@ -56,6 +57,12 @@ WARM_UP = 200  # number of steps after which the learning rate falls as a cosine
 # belong to which objects in images.
 OBJECTS = 1.0
 AVERAGE = 0.999  # decay per step of the average of the weights, which is saved
+# With `--delays`, the share of the chunks whose given rows have errors, and the largest standard
+# deviations of these errors, for the whole prefix and for each row, in units of an action. With
+# the demonstrated rows alone, a network learns to copy them, and never how to return to the path.
+ERRONEOUS, ERROR = 0.5, 0.4
+# The modules that are trained with `--delays`. The images are encoded as before.
+HEAD = ("context", "noisy", "when", "why", "blocks", "result", "given")
 MADE = "training.json"
 KEEP_EVERY = 500  # number of steps between two saved states
 SHOWN_EVERY = 100  # number of steps between two lines of the log
@@ -86,7 +93,16 @@ class Frames:
     objects: torch.Tensor
     action: torch.Tensor  # (N, D)
     tokens: torch.Tensor  # (N, L)
-    end: torch.Tensor  # index of the first frame after each frame's episode, (N,) int64
+    # The number of rows from each frame on that the policy had planned before, at the end of which
+    # the expert took over; 0 if the expert drives at the frame, (N,) int64.
+    given: torch.Tensor
+    # The index of the first frame after each frame's episode, or after the expert's part of it,
+    # (N,) int64.
+    end: torch.Tensor
+    # Whether each value of a frame's action is relative, (N, D) bool.
+    relative: torch.Tensor
+    # With `--delays`, the encoded training frames, (M, F) float16.
+    features: torch.Tensor | None = None
 
 
 def read(
@@ -95,10 +111,12 @@ def read(
     kept: Path,
     every: int = 1,
     start: Checkpoint | None = None,
+    delays: int = 0,
 ) -> tuple[Checkpoint, Frames]:
     """Read the dataset of each robot in a folder.
 
-    From a dataset with interventions, only the interventions are used for training.
+    From a dataset with interventions, only the interventions are used for training, and with
+    `delays` also the frames up to this number of rows before an intervention.
 
     Args:
         data: The folder, with a dataset for each robot.
@@ -107,12 +125,14 @@ def read(
         every: One of this number of consecutive frames is used for training, since neighbouring
             frames are nearly the same.
         start: The checkpoint that is trained further. Its words and units are kept.
+        delays: The largest number of given rows.
 
     Returns:
         The description of the checkpoint, and the frames.
     """
     sizes = NetworkSizes(words=1)
     texts, ends, places = list[str](), list[int](), list[int]()
+    given, relative = list[int](), list[np.ndarray]()
     states, objects, actions = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
     robots: dict[str, Embodiment] = {}
     with kept.open("wb") as file:
@@ -131,9 +151,11 @@ def read(
             corrected = INTERVENTION_COLUMN in dataset.features
             for session in dataset.sessions():
                 [episode] = session.episodes
-                begun, total = len(texts), len(texts) + episode.length
-                for step in dataset.steps(episode, Names(), None):
-                    if step.frame % every == 0 and (step.intervention or not corrected):
+                begun = len(texts)
+                steps = list(dataset.steps(episode, Names(), None))
+                waits, stops = corrections([step.intervention or not corrected for step in steps])
+                for step in steps:
+                    if step.frame % every == 0 and 0 <= waits[step.frame] <= delays:
                         seen = (step.obs.cameras[names[name]] for name in CAMERAS)
                         file.write(
                             np.stack(
@@ -144,7 +166,8 @@ def read(
                     own.append(state_vector(step.obs, parts))
                     around.append(state_vector(step.obs, contract.environment))
                     actions.append(step.expected[0])
-                ends += [total] * episode.length
+                given += waits
+                ends += [begun + stop for stop in stops]
                 texts += [episode.instruction] * episode.length
             found, things = np.stack(own), np.stack(around)
             robots[robot] = (
@@ -159,6 +182,9 @@ def read(
                 )
             )
             states.append(normalised(robots[robot], found, sizes.state))
+            columns = Columns.from_spec(contract.contract.action, len(actions[-1]))
+            is_relative = np.isin(np.arange(len(actions[-1])), columns.relative)
+            relative += [is_relative] * len(found)
             objects.append((things - things.mean(0)) / np.maximum(things.std(0), 1e-2))
     words = sorted({word for text in set(texts) for word in words_of(text)})
     sizes = sizes.model_copy(update={"words": len(words)})
@@ -178,8 +204,33 @@ def read(
         torch.from_numpy(np.concatenate(filled).astype(np.float32)),
         torch.from_numpy(np.stack(actions)),
         torch.from_numpy(np.stack([known[text] for text in texts])),
+        torch.tensor(given),
         torch.tensor(ends),
+        torch.from_numpy(np.stack(relative)),
     )
+
+
+def corrections(led: Sequence[bool]) -> tuple[list[int], list[int]]:
+    """Return for each frame of an episode the number of frames until the expert drives, and the
+    frame at which the expert then stops.
+
+    Args:
+        led: Whether the expert drives at each frame.
+
+    Returns:
+        The numbers of frames, -1 where the expert drives at no later frame; and the frames.
+    """
+    waits, stops = [0] * len(led), [0] * len(led)
+    wait, stop = -1, len(led)
+    for frame in reversed(range(len(led))):
+        if led[frame]:
+            if wait != 0:
+                stop = frame + 1
+            wait = 0
+        elif wait >= 0:
+            wait += 1
+        waits[frame], stops[frame] = wait, stop
+    return waits, stops
 
 
 def batches(frames: int, seed: int) -> Iterator[np.ndarray]:
@@ -206,14 +257,55 @@ class Training(torch.nn.Module):  # type: ignore[misc]  # torch's own types are 
 
     def forward(
         self,
-        tokens: torch.Tensor,
-        state: torch.Tensor,
-        images: Sequence[torch.Tensor],
+        features: torch.Tensor,
         noisy: torch.Tensor,
         times: torch.Tensor,
+        frozen: torch.Tensor | None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        context = self.network.encode(tokens, state, *images)
-        return self.network.velocity(context.repeat(DRAWS, 1), noisy, times), self.guess(context)
+        context = self.network.context_of(features)
+        repeated = context.repeat(DRAWS, 1)
+        if frozen is not None:
+            repeated = self.network.with_prefixes(repeated, noisy, frozen)
+        return self.network.velocity(repeated, noisy, times), self.guess(context)
+
+
+def encoded(network: ReferenceNetwork, frames: Frames, batch: np.ndarray) -> torch.Tensor:
+    """Return the features of training frames, (B, F), in the type of the network."""
+    index, dtype = frames.place[batch], next(network.parameters()).dtype
+    images = pixels(torch.from_numpy(frames.images[batch])).to(dtype).unbind(1)
+    features: torch.Tensor = network.features(
+        frames.tokens[index], frames.state[index].to(dtype), *images
+    )
+    return features
+
+
+def with_errors(
+    actions: torch.Tensor, lengths: torch.Tensor, relative: torch.Tensor, draws: torch.Generator
+) -> torch.Tensor:
+    """Return chunks whose given rows have errors, and whose later rows return to the demonstrated
+    path as fast as the limits of an action allow.
+
+    The errors are of relative columns alone: a target leads back to the path by itself.
+
+    Args:
+        actions: The demonstrated chunks, (B, H, D) in [-1, 1].
+        lengths: The number of given rows with errors of each chunk, (B,); 0 changes nothing.
+        relative: Whether each value is relative, (B, D).
+        draws: The generator of the errors.
+    """
+    size = ERROR * torch.rand(len(actions), 1, 1, generator=draws)
+    errors = torch.randn(actions.shape, generator=draws)
+    errors = size * (errors + torch.randn(actions[:, :1].shape, generator=draws))
+    path, reached = actions.cumsum(1), torch.zeros_like(actions[:, 0])
+    rows = []
+    for row in range(actions.shape[1]):
+        is_given = (row < lengths)[:, None]
+        returning = path[:, row] - reached
+        step = torch.where(is_given, actions[:, row] + errors[:, row], returning).clamp(-1, 1)
+        reached = reached + step
+        rows.append(step)
+    is_changed = (lengths > 0)[:, None, None] & relative[:, None]
+    return torch.where(is_changed, torch.stack(rows, 1), actions)
 
 
 def loss_of(
@@ -230,21 +322,41 @@ def loss_of(
         batch: The indices of the batch's frames among the training frames, (B,).
         draws: The generator of noise and times.
     """
-    index, horizon = frames.place[batch], training.network.sizes.horizon
+    index, sizes = frames.place[batch], training.network.sizes
+    horizon = sizes.horizon
     rows = index[:, None] + torch.arange(horizon)
     there = (rows < frames.end[index][:, None]).float()[..., None].repeat(DRAWS, 1, 1)
     actions = frames.action[rows.clamp(max=len(frames.action) - 1)].repeat(DRAWS, 1, 1)
     noise = torch.randn(actions.shape, generator=draws)
     times = 1 - 0.999 * torch.rand(len(actions), generator=draws) ** 1.5
+    frozen = None
+    if sizes.longest_prefix:
+        given = frames.given[index].repeat(DRAWS)
+        drawn = torch.randint(0, sizes.longest_prefix + 1, given.shape, generator=draws)
+        lengths = torch.where(given > 0, given, drawn)
+        has_errors = (torch.rand(given.shape, generator=draws) < ERRONEOUS) & (given == 0)
+        relative = frames.relative[index].repeat(DRAWS, 1)
+        actions = with_errors(actions, lengths * has_errors, relative, draws)
+        frozen = (torch.arange(horizon) < lengths[:, None]).float()[..., None]
+        there = there * (1 - frozen)
+
     noisy = times[:, None, None] * noise + (1 - times)[:, None, None] * actions
+    if frozen is not None:
+        noisy = frozen * actions + (1 - frozen) * noisy
     dtype = next(training.parameters()).dtype
-    images = pixels(torch.from_numpy(frames.images[batch])).to(dtype).unbind(1)
-    state = frames.state[index].to(dtype)
-    velocity, guessed = training(frames.tokens[index], state, images, noisy.to(dtype), times)
+    if frames.features is None:
+        features = encoded(training.network, frames, batch)
+    else:
+        features = frames.features[batch].to(dtype)
+    velocity, guessed = training(features, noisy.to(dtype), times, frozen)
     objects, flow = frames.objects[index], (velocity.float() - (noise - actions)) ** 2 * there
     known = ~objects.isnan()
     off = smooth_l1_loss(guessed.float()[known], objects[known]) if known.any() else torch.zeros(())
     return flow.sum() / there.sum() / actions.shape[-1], off
+
+
+def trained_values(training: Training) -> list[torch.nn.Parameter]:
+    return [value for value in training.parameters() if value.requires_grad]
 
 
 def fit(
@@ -261,14 +373,27 @@ def fit(
 
     The training continues from the state in the file `kept` if there is one, otherwise from
     `start`. Each thread computes a part of a batch, which is 1.4 times as fast as operations with
-    several threads.
+    several threads. With a `longest_prefix`, only the modules of `HEAD` are trained, so that each
+    frame is encoded once.
     """
     torch.manual_seed(seed)
     training = Training(checkpoint.sizes, frames.objects.shape[1])
     if start is not None:
-        training.network.load_state_dict(read_network(checkpoint.sizes, start).state_dict())
+        begun = read_network(read_checkpoint(start).sizes, start)
+        # A network without prefixes has no input for given rows.
+        training.network.load_state_dict(training.network.state_dict() | begun.state_dict())
+    if checkpoint.sizes.longest_prefix:
+        for name, value in training.network.named_parameters():
+            value.requires_grad_(name.partition(".")[0] in HEAD)
+        with torch.no_grad():
+            every_frame = np.arange(len(frames.place))
+            parts = [
+                encoded(training.network, frames, part).half()
+                for part in np.array_split(every_frame, -(-len(every_frame) // BATCH))
+            ]
+        frames = replace(frames, features=torch.cat(parts))
     average = copy.deepcopy(training)
-    own, mean = list(training.parameters()), list(average.parameters())
+    own, mean = trained_values(training), trained_values(average)
     copies = [copy.deepcopy(training).to(computing_dtype()) for _ in range(threads)]
     optimizer = torch.optim.AdamW(own, lr=rate, weight_decay=DECAY, betas=(0.9, 0.99), fused=True)
     first = 0
@@ -284,7 +409,7 @@ def fit(
         part: tuple[int, int, np.ndarray],
     ) -> tuple[tuple[float, float], tuple[torch.Tensor, ...]]:
         step, number, rows = part
-        low = list(copies[number].parameters())
+        low = trained_values(copies[number])
         with torch.no_grad():
             torch._foreach_copy_(low, own)
         draws = torch.Generator().manual_seed((seed * 2**32 + step) * threads + number)
@@ -294,7 +419,7 @@ def fit(
         )
 
     pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
-    begun, losses = time.monotonic(), list[tuple[float, float]]()
+    began, losses = time.monotonic(), list[tuple[float, float]]()
     for step, batch in zip(range(steps), batches(len(frames.place), seed), strict=False):
         if step < first:
             continue
@@ -313,7 +438,7 @@ def fit(
         losses += [loss for loss, _ in found]
         done = step + 1
         if done % SHOWN_EVERY == 0 or done == steps:
-            speed = (done - first) * BATCH / (time.monotonic() - begun)
+            speed = (done - first) * BATCH / (time.monotonic() - began)
             loss, error = np.mean(losses[-threads * SHOWN_EVERY :], axis=0)
             typer.echo(
                 f"step {done} of {steps}: loss {loss:.4f}, objects {error:.4f}, {speed:.0f} "
@@ -325,6 +450,16 @@ def fit(
             torch.save(state, kept.with_suffix(".part"))
             os.replace(kept.with_suffix(".part"), kept)
     return average.network
+
+
+def for_delays(checkpoint: Checkpoint, robots: Sequence[str], delays: int) -> Checkpoint:
+    """Return the description of a checkpoint whose head is trained with given rows of `robots`."""
+    return checkpoint.model_copy(
+        update={
+            "sizes": checkpoint.sizes.model_copy(update={"longest_prefix": delays}),
+            "embodiments": {robot: checkpoint.embodiments[robot] for robot in robots},
+        }
+    )
 
 
 def save(
@@ -357,17 +492,30 @@ def main(
         typer.Option(help="Checkpoint that is trained further; default: a new network."),
     ] = None,
     rate: Annotated[float, typer.Option(help="Largest learning rate.")] = RATE,
+    delays: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=NetworkSizes(words=1).horizon - 1,
+            help="Largest number of rows of the executed plan with which a chunk begins. Trains "
+            "the head of START alone, and keeps only the robots of DATA.",
+        ),
+    ] = 0,
     work: Annotated[
         Path, typer.Option(help="Folder for decoded images and the state of the training.")
     ] = Path("runs/reference/train"),
 ) -> None:
     """Train, and write the checkpoint."""
+    if delays and start is None:
+        raise typer.BadParameter("--delays: expected --start, a checkpoint whose head is trained")
     torch.use_deterministic_algorithms(True)
     work.mkdir(parents=True, exist_ok=True)
     named = {robot: dict(zip(CAMERAS, names.split(","), strict=True)) for robot, _, names in
              (one.partition("=") for one in cameras)}  # fmt: skip
     begun = None if start is None else read_checkpoint(start)
-    checkpoint, frames = read(data, named, work / "images.bin", every, begun)
+    checkpoint, frames = read(data, named, work / "images.bin", every, begun, delays)
+    if delays:
+        checkpoint = for_delays(checkpoint, list(named), delays)
     typer.echo(
         f"{len(frames.place)} of {len(frames.state)} frames of {len(named)} robots, "
         f"{len(checkpoint.words)} words"
@@ -388,6 +536,7 @@ def main(
         "processor": torch.backends.cpu.get_cpu_capability(),
         "torch": torch.__version__,
         "parameters": sum(value.numel() for value in network.parameters()),
+        **({"delays": delays} if delays else {}),
         "commit": code and code.commit,
     }
     if start is not None:

@@ -159,7 +159,16 @@ class ReferenceNetwork(nn.Module):
         self.register_buffer("grid", positions, persistent=False)
 
     def encode(self, tokens: Tensor, state: Tensor, *images: Tensor) -> Tensor:
-        """Return the context, (P, 2 * head).
+        """Return the context, (P, 2 * head); see `features` for the arguments."""
+        return self.context_of(self.features(tokens, state, *images))
+
+    def context_of(self, features: Tensor) -> Tensor:
+        """Return the context of the result of `features`, (P, 2 * head)."""
+        return silu(self.context(features))
+
+    def features(self, tokens: Tensor, state: Tensor, *images: Tensor) -> Tensor:
+        """Return all queries after they have attended to the words and the images, and the state,
+        (P, queries * width + S).
 
         Args:
             tokens: The words of the instructions, (P, L) int64; 0 is padding.
@@ -177,7 +186,7 @@ class ReferenceNetwork(nn.Module):
         for number, look in enumerate(self.looks):
             cameras = [camera[2 * number : 2 * number + 2] for camera in encoded]
             queries = look(queries, cameras, self.grid)
-        return silu(self.context(torch.cat([queries.flatten(1), state], -1)))
+        return torch.cat([queries.flatten(1), state], -1)
 
     def with_prefixes(self, context: Tensor, actions: Tensor, frozen: Tensor) -> Tensor:
         """Return the context of chunks that begin with given rows, (B, 2 * head).
