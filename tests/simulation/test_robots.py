@@ -8,6 +8,7 @@ of robots in time.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 
@@ -25,7 +26,10 @@ from tests.simulation.robots import (
     play_drawn,
     start_at_once,
 )
+from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
+from vlagents_ray.serve.in_time import WINDOW_S, RobotReport, RobotTimes, tolerated_age_ms
 from vlagents_ray.serve.queue.robots_load import CostCurve
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.success import Solved, SuccessCurve
 
 
@@ -228,3 +232,75 @@ def test_the_figures_of_a_fleet_are_those_of_a_direct_count(name: str, number: i
         tasks += moved / ticks * sum(rates) / len(rates) if rates else 0.0
     assert world.success(CURVE).successful == successful
     assert world.success(CURVE).tasks_per_gpu_hour == pytest.approx(tasks)
+
+
+class ReportingWorld(World):
+    """Robots that report the age of their last action in each request, as chunk players do, and a
+    replica that counts these reports with its answers.
+    """
+
+    def begin(self, tolerated_age_ms: float | None) -> ReportingWorld:
+        """Begin to count, with the largest age that the policy tolerates."""
+        self.stats = MetricsBuffer()
+        self.stats.enable()
+        self.tolerated_age_ms = tolerated_age_ms
+        self.times = {robot.name: RobotTimes() for robot in self.robots}
+        self.asked = dict.fromkeys(self.times, 0)  # number of ages before the last request
+        # Time of the answer, s, and reported age, ms.
+        self.counted: dict[str, list[tuple[float, float]]] = {name: [] for name in self.times}
+        return self
+
+    def _ask(self, robot: Robot, *args: Any, **kwargs: Any) -> None:
+        super()._ask(robot, *args, **kwargs)
+        new_ages_s = robot.ages[self.asked[robot.name] :]
+        self.asked[robot.name] = len(robot.ages)
+        age_ms = 1e3 * new_ages_s[-1] if new_ages_s else None
+        assert robot.waiting is not None
+        robot.waiting.observer_data["report"] = RobotReport(len(new_ages_s), 0, age_ms)
+
+    def _finish(self, batch: list[PendingRequest], took: float) -> None:
+        for pending in batch:
+            name, report = pending.session_id, pending.observer_data["report"]
+            report = report.compared(self.tolerated_age_ms)
+            self.stats.report("robot", report)
+            self.times[name].add(report, self.now)
+            if report.age_ms is not None:
+                self.counted[name].append((self.now, report.age_ms))
+        super()._finish(batch, took)
+
+
+@pytest.mark.parametrize("stops", [False, True])
+@pytest.mark.parametrize(("rows", "number"), [(8, 3), (8, 45), (8, 70), (50, 100)])
+def test_the_share_within_the_tolerance_is_that_of_a_direct_count(
+    rows: int, number: int, stops: bool
+) -> None:
+    curve = SuccessCurve(
+        "e", 10.0, "async", {"execute": 4}, {0: Solved(500, 500, 25.0), 3: Solved(490, 500, 30.0)}
+    )
+    tolerated_ms = tolerated_age_ms([curve])
+    assert tolerated_ms == 700
+    robots = fleet(number, (rows, 10.0))
+    for robot in robots:
+        robot.stops = stops
+    world = ReportingWorld(PI0, robots, seed=number).begin(tolerated_ms)
+    world.run(25.0)
+
+    ages_ms = [age_ms for counted in world.counted.values() for _, age_ms in counted]
+    within = sum(age_ms <= tolerated_ms for age_ms in ages_ms)
+    collected = world.stats.collect()
+    assert (collected.compared["robot"], collected.tolerated["robot"]) == (len(ages_ms), within)
+    for name, times in world.times.items():
+        lately = [age for when, age in world.counted[name] if when > world.now - WINDOW_S]
+        expected = sum(age <= tolerated_ms for age in lately) / len(lately) if lately else None
+        assert times.within_tolerance(world.now) == expected
+
+
+def test_without_a_curve_nothing_is_within_the_tolerance_or_beyond_it() -> None:
+    assert tolerated_age_ms([]) is None
+    world = ReportingWorld(PI0, fleet(3, (8, 10.0)), seed=1).begin(tolerated_age_ms([]))
+    world.run(5.0)
+    collected = world.stats.collect()
+    assert collected.ages_ms
+    assert not collected.compared
+    assert not collected.tolerated
+    assert {times.within_tolerance(world.now) for times in world.times.values()} == {None}

@@ -194,15 +194,20 @@ def test_a_slow_viewer_misses_the_oldest(
 
 def test_a_snapshot_has_the_share_in_time_of_each_robot(own: ReplicaView) -> None:
     engine = own._engine
-    for name, starved in (("good", 1), ("late", 10)):
+    for name, starved, is_tolerated in (
+        ("good", 1, True),
+        ("late", 10, False),
+        ("unmeasured", 1, None),
+    ):
         session = opened(engine.sessions, name)
         session.times = RobotTimes()
-        session.times.add(RobotReport(100, starved, 80.0), engine.clock())
+        session.times.add(RobotReport(100, starved, 80.0, is_tolerated), engine.clock())
     opened(engine.sessions, "silent")
 
     document = own.read(0, ()).document
     assert {one["id"]: one["in_time"] for one in document["sessions"]} == {
-        "good": {"share": 0.99, "age_p95_ms": 80.0},
-        "late": {"share": 0.9, "age_p95_ms": 80.0},
+        "good": {"share": 0.99, "age_p95_ms": 80.0, "within_tolerance": 1.0},
+        "late": {"share": 0.9, "age_p95_ms": 80.0, "within_tolerance": 0.0},
+        "unmeasured": {"share": 0.99, "age_p95_ms": 80.0, "within_tolerance": None},
         "silent": None,
     }

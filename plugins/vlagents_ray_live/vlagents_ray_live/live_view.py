@@ -252,13 +252,17 @@ def _in_time(session: Session[LoadedModel], now: float) -> dict[str, Any] | None
     """Describe how well a session's robot was served lately; None if the robot does not report
     this.
     """
-    lately = None if session.times is None else session.times.lately(now)
-    if lately is None or lately.share is None:
+    if session.times is None:
+        return None
+    lately = session.times.lately(now)
+    if lately.share is None:
         return None
     age_ms = lately.age_p95_ms
+    within_tolerance = session.times.within_tolerance(now)
     return {
         "share": round(lately.share, 4),
         "age_p95_ms": None if age_ms is None else round(age_ms, 1),
+        "within_tolerance": None if within_tolerance is None else round(within_tolerance, 4),
     }
 
 

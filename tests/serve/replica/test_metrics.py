@@ -18,7 +18,7 @@ from vlagents_ray.serve.replica import metrics
 from vlagents_ray.serve.replica.metrics import Exporter
 from vlagents_ray.serve.requests import Origin
 
-SERIES = 20  # number of metrics with values in a replica without a GPU, for any number of robots
+SERIES = 22  # number of metrics with values in a replica without a GPU, for any number of robots
 
 
 def test_the_series_of_a_gpu_have_values_only_with_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,6 +85,16 @@ def test_the_ticks_of_a_robot_that_is_always_in_time_are_exported(
     exporter.export()
     assert (written["ticks"], written["executed_age_ms"]) == (10, 30.0)
     assert "starved_ticks" not in written
+    assert not {"compared_ages", "ages_beyond_tolerance"} & written.keys()
+
+    engine.stats.report("robot", RobotReport(10, 0, 30.0, is_tolerated=True))
+    exporter.export()
+    assert written["compared_ages"] == 1
+    assert "ages_beyond_tolerance" not in written
+    for is_tolerated in (False, True, False):
+        engine.stats.report("robot", RobotReport(10, 0, 30.0, is_tolerated))
+    exporter.export()
+    assert (written["compared_ages"], written["ages_beyond_tolerance"]) == (3, 2)
 
     engine.stats.report("robot", RobotReport(0, 0, None))
     exporter.export()
@@ -138,13 +148,14 @@ def test_the_number_of_series_does_not_grow_with_the_robots(
     exporter = Exporter(engine, {})
     engine.stats.enable()
 
-    report = RobotReport(10, 1, 30.0)
+    report = RobotReport(10, 1, 30.0, is_tolerated=False)
     for _ in range(robots):
         engine.stats.report("robot", report)
         engine.stats.handled(("act", "websocket", "robot", "ok"), (5.0, 1.0, 1.0, 2.0, 1.0))
     exporter.export()
 
     in_time = {"ticks", "starved_ticks", "executed_age_ms"}
+    in_time |= {"compared_ages", "ages_beyond_tolerance"}
     labels = {name: [] for name in in_time}
     for name, tags in sorted(series_of_values):
         if name in in_time:
@@ -154,6 +165,8 @@ def test_the_number_of_series_does_not_grow_with_the_robots(
         "ticks": [robot],
         "starved_ticks": [robot],
         "executed_age_ms": [robot],
+        "compared_ages": [robot],
+        "ages_beyond_tolerance": [robot],
     }
     assert len(series_of_values) == SERIES
     engine.close()

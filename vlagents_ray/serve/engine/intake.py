@@ -56,6 +56,17 @@ class ReceivedReport:
     clock: Callable[[], float]
     session: Session[Any] | None = None  # the session that has executed the request
 
+    def executed_by(self, session: Session[Any], tolerated_age_ms: float | None) -> None:
+        """Record which session has executed the request.
+
+        Args:
+            session: The session.
+            tolerated_age_ms: The largest age of an action that its policy tolerates, ms; None if
+                it is not known.
+        """
+        self.session = session
+        self.report = self.report.compared(tolerated_age_ms)
+
     def count(self) -> None:
         """Add the report to the metrics, and to the session if it has executed the request."""
         self.stats.report(self.priority, self.report)

@@ -72,6 +72,9 @@ class Collected:
     ticks: Counter[str] = field(default_factory=Counter)
     starved: Counter[str] = field(default_factory=Counter)
     ages_ms: dict[str, Sample[float]] = field(default_factory=dict)
+    # Number of ages that were compared with the tolerance of the policy, and of those within it.
+    compared: Counter[str] = field(default_factory=Counter)
+    tolerated: Counter[str] = field(default_factory=Counter)
 
 
 class MetricsBuffer:
@@ -142,6 +145,9 @@ class MetricsBuffer:
             collected.starved[priority] += report.starved
             if report.age_ms is not None:
                 collected.ages_ms.setdefault(priority, Sample()).add(report.age_ms)
+            if report.is_tolerated is not None:
+                collected.compared[priority] += 1
+                collected.tolerated[priority] += report.is_tolerated
 
     def batch(self, observations: int, rows: int) -> None:
         """Record a forward pass with this number of observations, and this number of rows including

@@ -371,7 +371,9 @@ class Runner:
             model.check(pending.request)
         self._sessions.use(session, pending.origin)
         if pending.message.reports and pending.index in pending.message.reports:
-            pending.message.reports[pending.index].session = session
+            # The measured success is that of the loaded checkpoint.
+            tolerated_age_ms = None if weights.number else model.tolerated_age_ms
+            pending.message.reports[pending.index].executed_by(session, tolerated_age_ms)
         return session, model, weights
 
     def _call(self, pending: PendingRequest) -> Any:

@@ -31,8 +31,10 @@ from vlagents_ray.policies.base.program import Program, digest_of, files_named, 
 from vlagents_ray.policies.loading import LoadingReport, loading_report
 from vlagents_ray.policies.wrapper import unwrapped
 from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.in_time import tolerated_age_ms
 from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
 from vlagents_ray.serve.weights import HoldsWeights, ModelWeights
+from vlagents_ray.success import SuccessCurve
 from vlagents_ray.validation import check_observation, check_reset
 
 logger = logging.getLogger(__name__)
@@ -149,10 +151,16 @@ class LoadedModel:
     # captured as a CUDA graph. Without an accelerator, each model has a separate lock, which costs
     # less.
     uncaptured: AbstractContextManager[Any] = field(init=False)
+    # The largest age of an executed action that the policy tolerates, ms; None if it is not known.
+    tolerated_age_ms: float | None = field(init=False)
     _calls_by_kind: dict[tuple[str, Hashable], PolicyCall] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Determine whether this process computes on an accelerator."""
+        """Determine whether this process computes on an accelerator, and read the measured
+        success.
+        """
+        curves = (self.weights or {}).get("success", ())
+        self.tolerated_age_ms = tolerated_age_ms(map(SuccessCurve.from_json, curves))
         torch = sys.modules.get("torch")
         self.acts = ActStream.for_report(self.report)
         self.uncaptured = (

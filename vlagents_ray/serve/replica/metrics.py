@@ -112,7 +112,7 @@ class Exporter:
         self._uncompiled = make(
             Gauge, "uncompiled", "Batch sizes that run without the configured compilation."
         )
-        # The next three series describe robots that report their ticks.
+        # The next five series describe robots that report their ticks.
         self._ticks = make(
             Counter,
             "ticks",
@@ -131,6 +131,18 @@ class Exporter:
             "Age of executed actions, as reported by robots.",
             "priority",
             boundaries=MS_BOUNDARIES,
+        )
+        self._compared_ages = make(
+            Counter,
+            "compared_ages",
+            "Ages of executed actions that were compared with the policy's tolerance.",
+            "priority",
+        )
+        self._beyond_tolerance = make(
+            Counter,
+            "ages_beyond_tolerance",
+            "Ages of executed actions that the policy does not tolerate.",
+            "priority",
         )
         self._unreadable = make(
             Gauge, "keys_unreadable_s", "Time in which the key file could not be read."
@@ -186,6 +198,12 @@ class Exporter:
             self._batch.observe(observations)
         for op, calls in collected.hung.items():
             self._hung.inc(calls, {"op": op})
+        self._export_reports(collected)
+        if collected.padding:
+            self._padding.inc(collected.padding)
+
+    def _export_reports(self, collected: Collected) -> None:
+        """Export the reports of robots."""
         for priority, ticks in collected.ticks.items():
             starved = collected.starved[priority]
             if ticks:  # Ray's counters raise an error for 0
@@ -195,8 +213,11 @@ class Exporter:
         for priority, ages_ms in collected.ages_ms.items():
             for age_ms in _in_slices(ages_ms.values):
                 self._executed_age.observe(age_ms, {"priority": priority})
-        if collected.padding:
-            self._padding.inc(collected.padding)
+        for priority, compared in collected.compared.items():
+            self._compared_ages.inc(compared, {"priority": priority})
+            beyond = compared - collected.tolerated[priority]
+            if beyond:
+                self._beyond_tolerance.inc(beyond, {"priority": priority})
 
     def _export_gpu_work(self, collected: Collected) -> None:
         for took_ms in _in_slices(collected.gpu_ms.values):

@@ -299,6 +299,7 @@ class Card {
     this.tell({
       "ticks in time": inTime ? `${(100 * inTime.share).toFixed(1)} %` : null,
       "age p95": inTime && inTime.age_p95_ms !== null ? `${Math.round(inTime.age_p95_ms)} ms` : null,
+      "within tolerance": inTime && inTime.within_tolerance !== null ? `${(100 * inTime.within_tolerance).toFixed(1)} %` : null,
     });
     this.tell({ step: said.step, "weights version": said.version, "last request": `${said.silent_s.toFixed(1)} s ago` });
   }
