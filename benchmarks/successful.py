@@ -102,7 +102,8 @@ class FleetSuccess:
 
 
 def curve_of(checkpoint: Path, loop: str = "player") -> SuccessCurve | None:
-    """Return the measured success of a checkpoint with a control loop; None if it was not measured.
+    """Return the measured success of a checkpoint with a control loop and its default settings, in
+    the hardest environment; None if it was not measured (`benchmarks.delays`).
 
     Args:
         checkpoint: The folder of the checkpoint.
@@ -113,4 +114,5 @@ def curve_of(checkpoint: Path, loop: str = "player") -> SuccessCurve | None:
     """
     mode = {"player": "async", "waiting": "open_loop"}[loop]
     curves = [curve for curve in read_curves(checkpoint) if curve.mode == mode]
-    return max(curves, key=lambda curve: curve.tolerated, default=None)
+    by_default = [curve for curve in curves if curve.settings.keys() <= {"execute"}]
+    return min(by_default, key=lambda curve: curve.tolerated, default=None)

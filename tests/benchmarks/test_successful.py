@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.robot_process import Figures
-from benchmarks.successful import FleetSuccess, ServedRobot
+from benchmarks.successful import FleetSuccess, ServedRobot, curve_of
 from vlagents_ray.chunking.fallback import LATE, WAITING
 from vlagents_ray.interface import AGE_MS, CAUSE, CHUNK, IN_TIME, ROW, SAFE
-from vlagents_ray.success import Solved, SuccessCurve
+from vlagents_ray.success import Solved, SuccessCurve, write_curves
 
 EPISODES = 500
 CURVE = SuccessCurve(
@@ -101,6 +103,20 @@ def test_a_later_answer_makes_no_robot_successful(
 
 def robot(*delays: float, starved: float = 0, waits: tuple[float, ...] = ()) -> ServedRobot:
     return ServedRobot(10.0, 100 + sum(waits), starved, waits, delays)
+
+
+def test_the_curve_of_a_loop_is_that_of_its_default_settings_in_the_hardest_environment(
+    tmp_path: Path,
+) -> None:
+    assert curve_of(tmp_path) is None
+    hard = replace(CURVE, env="hard", solved={0: CURVE.solved[0]})
+    waiting = replace(CURVE, mode="open_loop")
+    prefixes = replace(CURVE, settings={"execute": 4, "real_time_chunking": True})
+    write_curves(tmp_path, [prefixes, CURVE, hard, waiting])
+    assert curve_of(tmp_path) == hard
+    assert curve_of(tmp_path, "waiting") == waiting
+    write_curves(tmp_path, [prefixes])
+    assert curve_of(tmp_path) is None
 
 
 def test_a_chosen_wait_is_in_time_for_as_long_as_the_tolerated_delay() -> None:

@@ -227,7 +227,10 @@ def deliver(answers: Iterable[Answer]) -> None:
 class UncountedReport(Protocol):
     """A robot's report in a request that is not answered yet."""
 
-    session: Any  # the `Session` that has executed the request; None before
+    def executed_by(self, session: Any, tolerated_age_ms: float | None) -> None:
+        """Record the `Session` that has executed the request, and the largest age of an action that
+        its policy tolerates, ms; None if it is not known.
+        """
 
     def count(self) -> None:
         """Add the report to the figures of its session and of the replica."""
