@@ -59,7 +59,7 @@ DEADLINE = "deadline_ms"
 # LEFTOVER.
 LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan, from this observation's tick
 # int: the expected number of ticks until the answer arrives, at most the number of rows of
-# LEFTOVER; 0 if unknown.
+# LEFTOVER. 0 if no row will be executed, or if the delay is unknown; the plan is then not read.
 DELAY = "delay_ticks"
 # In an observation, float: the time that the server may take to answer, from the arrival of the
 # request, ms. It is 0 if the robot has no rows left.

@@ -35,6 +35,42 @@ _LOG_2_PI = math.log(2 * math.pi)
 Change = Callable[[Any, Any, float], Any]
 """A change of a step: velocity (B, H, D), noisy actions (B, H, D) and flow time -> new velocity."""
 
+Velocity = Callable[[Any], Any]
+"""The velocity of a flow at one time: noisy actions (B, H, D) -> velocity (B, H, D)."""
+
+Guidance = Callable[[Velocity, Any, float], Any]
+"""Guides a step: velocity, noisy actions (B, H, D) and flow time -> guided velocity (B, H, D)."""
+
+PullBack = Callable[[Velocity, Any, Any, Callable[[Any], Any]], tuple[Any, Any]]
+"""Computes a correction of noisy actions, see `pull_back`."""
+
+
+def pull_back(
+    velocity: Velocity, actions: Any, time: float, error: Callable[[Any], Any]
+) -> tuple[Any, Any]:
+    """Multiply an error of the expected actions by the transposed Jacobian of the flow.
+
+    The expected actions at a flow time are `actions - time * velocity(actions)`. An error of some
+    rows thereby corrects all rows that the flow relates to them. This is for torch, outside of its
+    inference mode.
+
+    Args:
+        velocity: The velocity of the flow.
+        actions: The noisy actions, (B, H, D).
+        time: The flow time.
+        error: Returns the error (B, H, D) of expected actions (B, H, D).
+
+    Returns:
+        The velocity (B, H, D), and the correction of the noisy actions (B, H, D).
+    """
+    torch = require("torch")
+    with torch.enable_grad():
+        noisy = actions.detach().requires_grad_()
+        taken = velocity(noisy)
+        expected = noisy - time * taken
+        [correction] = torch.autograd.grad(expected, noisy, error(expected.detach()))
+    return taken.detach(), correction
+
 
 def follow(velocity: Callable[[Any, float], Any], noise: Any, steps: int, *changes: Change) -> Any:
     """Integrate noise (B, H, D) to actions in Euler steps, from flow time 1 to 0.
@@ -245,20 +281,24 @@ class Guide:
         """Return the guide that follows from the `delay` and the `leftover` of rows in the model's
         units.
 
+        Without a delay, no row of the plan is executed before the chunk arrives. The chunk is then
+        computed as without a plan, since the new observation is better than the old plan.
+
         Returns:
-            The guide; None if no row has a leftover plan.
+            The guide; None if no row has both a leftover plan and a delay.
         """
-        if all(row.leftover is None for row in rows):
+        delays = [0 if row.leftover is None else min(row.delay, len(row.leftover)) for row in rows]
+        if max(delays, default=0) <= 0:
             return None
 
         plan = np.zeros((len(rows), horizon, dim), np.float32)
         frozen = np.zeros((len(rows), horizon, 1), np.float32)
         weight = np.zeros((len(rows), horizon, 1), np.float32)
-        for i, row in enumerate(rows):
-            if row.leftover is None:
+        for i, (row, planned_delay) in enumerate(zip(rows, delays, strict=True)):
+            if row.leftover is None or planned_delay <= 0:
                 continue
             leftover = row.leftover[:horizon]
-            delay = min(max(row.delay, 0), len(leftover))
+            delay = min(planned_delay, horizon)
             plan[i, : len(leftover), : leftover.shape[1]] = leftover
             frozen[i, :delay] = 1.0
 
@@ -288,32 +328,38 @@ class Guide:
 
     def steer(
         self,
-        velocity: Any,
+        velocity: Velocity,
         actions: Any,
         time: Any,
         *,
-        noise: Any,
-        steps: int,
         limit: float,
         lower: Callable[[Any, float], Any] = min,
+        pull: PullBack = pull_back,
     ) -> Any:
-        """Return the velocity (B, H, D), corrected towards the plan.
+        """Return the velocity (B, H, D), guided towards the plan.
+
+        This is real-time chunking (https://arxiv.org/abs/2506.07339, equations 2 to 4). The
+        difference between the plan and the expected actions is multiplied by the weights of the
+        rows and by the transposed Jacobian of the flow, through which the frozen rows also move the
+        later ones. Chunks without a plan keep their velocity.
 
         Args:
-            velocity: The velocity of the flow, (B, H, D).
+            velocity: The velocity of the flow at this time.
             actions: The noisy actions, (B, H, D).
             time: The flow time.
-            noise: The noise with which the flow began, (B, H, D).
-            steps: The number of steps. The gain is limited to this number, since a single step with
-                that gain already reaches the plan.
             limit: The largest gain of the correction.
             lower: Returns the smaller of two numbers, for libraries whose `time` is not a plain
                 number.
+            pull: Multiplies by the Jacobian, as `pull_back` does for torch.
         """
+
+        def error(expected: Any) -> Any:
+            return (self.frozen + self.weight) * (self.plan - expected)
+
+        taken, correction = pull(velocity, actions, time, error)
         spread = (1.0 - time) ** 2 + time**2
-        gain = lower(spread / (time * (1.0 - time) + 1e-6), min(limit, float(steps)))
-        pulled = velocity - gain * self.weight * (self.plan - (actions - time * velocity))
-        return self.frozen * (noise - self.plan) + (1.0 - self.frozen) * pulled
+        gain = lower(spread / (time * (1.0 - time) + 1e-6), limit)
+        return taken - gain * correction
 
 
 class FlowPasses(abc.ABC):
@@ -452,22 +498,28 @@ class FlowPasses(abc.ABC):
         changes: list[Change] = []
 
         guide = Guide.for_rows(rows, horizon, width)
+        guidance: Guidance | None = None
         frozen = None
         if guide is not None and self.has_prefixes:
             prefixes = guide.to(convert)
             start, frozen = prefixes.insert_frozen(start), prefixes.frozen
             changes.append(prefixes.keep)
         elif guide is not None:
-            converted = guide.to(convert)
-            changes.append(
-                partial(converted.steer, noise=start, steps=steps, limit=config.guidance)
-            )
+            # A single step with the gain `steps` already reaches the plan.
+            limit = min(config.guidance, float(steps))
+            guidance = partial(guide.to(convert).steer, limit=limit)
         random = RandomSteps.for_rows(rows, (steps, horizon, width), config.noise_level, convert)
         if random is not None:
             changes.append(random.change)
 
         flow = self.sample(
-            *inputs, noise=start, owners=owners, steps=steps, changes=changes, frozen=frozen
+            *inputs,
+            noise=start,
+            owners=owners,
+            steps=steps,
+            changes=changes,
+            guidance=guidance,
+            frozen=frozen,
         )
         outputs = {} if random is None else random.outputs(config.execute, dim)
         return fetch(flow), outputs
@@ -484,11 +536,14 @@ class FlowPasses(abc.ABC):
         owners: Sequence[int],
         steps: int,
         changes: Sequence[Change] = (),
+        guidance: Guidance | None = None,
         frozen: Any = None,
         states: Any = None,
         state_masks: Any = None,
     ) -> Any:
         """Return actions (B, H, D).
+
+        A guided flow is not compiled, since its steps need the gradient of the network.
 
         Args:
             images: The images of P observations, (P, 3, H, W) for each of N cameras.
@@ -500,6 +555,7 @@ class FlowPasses(abc.ABC):
             owners: The index of the observation of each row.
             steps: The number of steps of the flow.
             changes: See `follow`.
+            guidance: The guidance of each step, before the changes; None if no chunk is guided.
             frozen: 1.0 for the rows of chunks that are already actions, and 0.0 for other rows, (B,
                 H, 1); None if there are no such rows. With `by_row`, their flow time is 0.
             states: The states of a memory, an argument that LeRobot's π0.5 passes since 0.6.1. It
@@ -520,9 +576,24 @@ class FlowPasses(abc.ABC):
         if frozen is not None:
             encoded = self.with_prefixes(encoded, noise, frozen)
 
+        if guidance is not None:
+            return self._guided_flow(steps, changes, guidance, encoded, present, state, noise)
         changed = partial(self._flow, steps, changes, frozen if self.by_row else None)
         flow = changed if changes else self._whole_flow(steps)
         return flow(encoded, present, state, noise)
+
+    def _guided_flow(
+        self, steps: int, changes: Sequence[Change], guidance: Guidance, *inputs: Any
+    ) -> Any:
+        """Return actions (B, H, D), see `_flow`.
+
+        Policies run in torch's inference mode, whose tensors cannot be differentiated. The steps
+        therefore run outside of it, on copies of their inputs.
+        """
+        torch = require("torch")
+        with torch.inference_mode(False), torch.no_grad():
+            copies = [tensor.clone() for tensor in inputs]
+            return self._flow(steps, changes, None, *copies, guidance=guidance)
 
     def _whole_flow(self, steps: int) -> Callable[..., Any]:
         """Return the core of the whole flow, without changes of the velocity."""
@@ -540,6 +611,8 @@ class FlowPasses(abc.ABC):
         present: Any,
         state: Any,
         noise: Any,
+        *,
+        guidance: Guidance | None = None,
     ) -> Any:
         """Return actions (B, H, D).
 
@@ -558,6 +631,12 @@ class FlowPasses(abc.ABC):
 
         def velocity(actions: Any, step: int) -> Any:
             """Return the velocity at the flow time of a step."""
-            return self._velocity(*constants, actions, at_times[:, step])
+            if guidance is None:
+                return self._velocity(*constants, actions, at_times[:, step])
+
+            def at_step(noisy: Any) -> Any:
+                return self._step(*constants, noisy, at_times[:, step])
+
+            return guidance(at_step, actions, 1.0 - step / steps)
 
         return follow_steps(velocity, noise, steps, *changes)

@@ -35,7 +35,7 @@ from vlagents_ray.policies.base.model_inputs import (
 )
 from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow import OFFERED, Guide
+from vlagents_ray.policies.flow import OFFERED, Guide, Velocity
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
 from vlagents_ray_models.attention_config import AttentionConfig
@@ -482,6 +482,22 @@ class OpenPiModel(abc.ABC):
         """
 
 
+def pull_back_in_jax(
+    velocity: Velocity, actions: Any, time: Any, error: Callable[[Any], Any]
+) -> tuple[Any, Any]:
+    """Multiply an error by the transposed Jacobian of a flow in JAX, as
+    `vlagents_ray.policies.flow.pull_back` does in torch.
+    """
+
+    def expected_actions(noisy: Any) -> tuple[Any, Any]:
+        taken = velocity(noisy)
+        return noisy - time * taken, taken
+
+    expected, pull, taken = require("jax").vjp(expected_actions, actions, has_aux=True)
+    [correction] = pull(error(expected))
+    return taken, correction
+
+
 class JaxFlow(OpenPiModel):
     """π0 and π0.5 in JAX, as two programs, each compiled once per number of rows.
 
@@ -500,7 +516,8 @@ class JaxFlow(OpenPiModel):
         jnp = jax.numpy
         self.trained, merge = _split(network)
         self._device = device
-        steps, limit = config.steps or _STEPS, config.guidance
+        steps = config.steps or _STEPS
+        limit = min(config.guidance, float(steps))
 
         def encode(params: Any, batch: Any) -> Any:
             model = merge(params)
@@ -519,8 +536,7 @@ class JaxFlow(OpenPiModel):
             cache = keys.swapaxes(0, 1), values.swapaxes(0, 1)
             observation = models.Observation(images={}, image_masks={}, state=proprio)
 
-            def step(carry: Any) -> Any:
-                actions, time = carry
+            def velocity_at(actions: Any, time: Any) -> Any:
                 times = jnp.broadcast_to(time, len(noise))
                 tokens, present, causal, condition = model.embed_suffix(observation, actions, times)
                 prefix_mask = jnp.broadcast_to(
@@ -535,16 +551,24 @@ class JaxFlow(OpenPiModel):
                     adarms_cond=[None, condition],
                 )
 
-                velocity = model.action_out_proj(hidden[:, -noise.shape[1] :])
-                velocity = guide.steer(
-                    velocity,
+                return model.action_out_proj(hidden[:, -noise.shape[1] :])
+
+            def guided_velocity(actions: Any, time: Any) -> Any:
+                return guide.steer(
+                    lambda noisy: velocity_at(noisy, time),
                     actions,
                     time,
-                    noise=noise,
-                    steps=steps,
                     limit=limit,
                     lower=jnp.minimum,
+                    pull=pull_back_in_jax,
                 )
+
+            is_guided = (guide.frozen + guide.weight).any()
+
+            def step(carry: Any) -> Any:
+                actions, time = carry
+                # The gradient is computed only if a chunk is guided.
+                velocity = jax.lax.cond(is_guided, guided_velocity, velocity_at, actions, time)
                 return actions - velocity / steps, time - 1 / steps
 
             def is_unfinished(carry: Any) -> Any:

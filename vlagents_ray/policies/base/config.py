@@ -26,7 +26,7 @@ NoiseLevel = Annotated[
 ]
 
 Guidance = Annotated[
-    float, Field(gt=0, description="real-time chunking: largest weight of the old plan")
+    float, Field(gt=0, description="real-time chunking: largest gain of the guidance to the plan")
 ]
 
 

@@ -11,6 +11,7 @@ import inspect
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,7 +24,7 @@ from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import GRIPPER
 from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow import Change, FlowPasses, Guide, RandomSteps
+from vlagents_ray.policies.flow import Change, FlowPasses, Guidance, Guide, RandomSteps
 from vlagents_ray.registry import require
 from vlagents_ray_models.key_value_cache import cache_of, layers_of, stack_of
 from vlagents_ray_models.pi0_passes import Pi0Passes
@@ -278,6 +279,7 @@ class FlowSampler(Sampler):
         )
 
         changes: list[Change] = []
+        guidance: Guidance | None = None
         frozen = None
         prefix_rows: dict[int, int] = {}
         if any(leftover is not None for leftover in leftovers):
@@ -289,16 +291,19 @@ class FlowSampler(Sampler):
                 prefixes = Guide.for_rows(list(map(self._prefixed, rows, plans)), *shape)
 
             if prefixes is not None:
-                for i, plan in enumerate(plans):
-                    if plan is not None:
-                        prefix_rows[i] = int(prefixes.frozen[i].sum())
+                for i, count in enumerate(prefixes.frozen.sum((1, 2))):
+                    if count:
+                        prefix_rows[i] = int(count)
                 prefixes = prefixes.to(upload)
                 noise = prefixes.insert_frozen(noise)
                 frozen = prefixes.frozen
                 changes.append(prefixes.keep)
-            else:
-                delays = [row.delay for row in rows]
-                changes.append(guided(self.policy.rtc_processor, plans, delays, shape, upload))
+            elif not self.longest:
+                processor, delays = self.policy.rtc_processor, [row.delay for row in rows]
+                guide = guide_of(processor, plans, delays, shape)
+                if guide is not None:
+                    limit = float(processor.rtc_config.max_guidance_weight)
+                    guidance = partial(guide.to(upload).steer, limit=limit)
         if self.random_steps is not None:
             changes.append(self.random_steps.change)
         self.prefix_rows = prefix_rows
@@ -309,6 +314,7 @@ class FlowSampler(Sampler):
             owners=self._shared(rows)[1],
             steps=self.flow_steps,
             changes=changes,
+            guidance=guidance,
             frozen=frozen,
         )
 
@@ -326,9 +332,8 @@ class FlowSampler(Sampler):
 
         Its delay is set to the number of rows of the plan that the policy reads.
         """
-        # Before the first answer, the delay is unknown.
-        delay = min(row.delay or self.longest, self.longest)
-        return replace(row, leftover=None if plan is None else fetch(plan), delay=delay)
+        leftover = None if plan is None else fetch(plan)
+        return replace(row, leftover=leftover, delay=min(row.delay, self.longest))
 
     def _encoded(self, leftover: Any) -> Any:
         """Convert a leftover plan to the units of π0's ALOHA, if SmolVLA was trained in these
@@ -339,15 +344,11 @@ class FlowSampler(Sampler):
         return self.policy._pi_aloha_encode_actions_inv(leftover[None].clone())[0]
 
 
-def guided(
-    processor: Any,
-    plans: Sequence[Any],
-    delays: Sequence[int],
-    shape: tuple[int, int],
-    convert: Any,
-) -> Change:
-    """Return the change of velocities that guides chunks towards the leftover plans of their
-    sessions, as LeRobot does.
+def guide_of(
+    processor: Any, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int]
+) -> Guide | None:
+    """Return the guide of chunks that continue the leftover plans of their sessions, with the
+    weights of LeRobot's schedule.
 
     Args:
         processor: The policy's `RTCProcessor`, for its settings and its schedule.
@@ -355,33 +356,22 @@ def guided(
         delays: The number of actions of each row that will have been executed when the chunk
             arrives.
         shape: The number of rows of a chunk and of values of a row, (H, D).
-        convert: A function that converts an array to a tensor on the policy's device.
+
+    Returns:
+        The guide; None if no row has both a leftover plan and a delay.
     """
-    torch, settings = require("torch"), processor.rtc_config
     rows, dim = shape
-    target = torch.zeros(len(plans), rows, dim)
-    weights = torch.zeros(len(plans), rows, 1)
+    target = np.zeros((len(plans), rows, dim), np.float32)
+    weights = np.zeros((len(plans), rows, 1), np.float32)
     for i, (plan, delay) in enumerate(zip(plans, delays, strict=True)):
-        if plan is None:
+        if plan is None or delay <= 0 or not len(plan):
             continue
-        leftover = plan[:rows]
+        leftover = fetch(plan[:rows])
         target[i, : len(leftover), : leftover.shape[1]] = leftover
-        horizon = min(settings.execution_horizon, len(leftover))
-        weights[i, :, 0] = processor.get_prefix_weights(max(delay, 0), horizon, rows)
-
-    target, weights = convert(target.numpy()), convert(weights.numpy())
-    max_strength = float(settings.max_guidance_weight)
-
-    def change(velocity: Any, actions: Any, time: float) -> Any:
-        expected_end = actions - time * velocity
-        done = 1 - time
-        if done == 0:
-            strength = max_strength
-        else:
-            strength = min(max_strength, time / done * (time**2 + done**2) / time**2)
-        return velocity - strength * weights * (target - expected_end)
-
-    return change
+        horizon = min(processor.rtc_config.execution_horizon, len(leftover))
+        weights[i, :, 0] = processor.get_prefix_weights(delay, horizon, rows)
+    # The weights of LeRobot's schedule include the frozen rows.
+    return Guide(target, np.zeros_like(weights), weights) if weights.any() else None
 
 
 class SmolVLAPasses(FlowPasses):

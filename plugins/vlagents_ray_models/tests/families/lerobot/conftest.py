@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 
 from plugins.vlagents_ray_models.tests.families.lerobot import tiny
 from vlagents_ray import Obs
@@ -78,6 +79,25 @@ def loaded(made: Made) -> Load:
         return policy
 
     return load
+
+
+@pytest.fixture
+def connected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gives LeRobot's guidance the gradient of its velocity, as in the paper.
+
+    LeRobot computes the velocity before it calls `requires_grad_`, so that its gradient is the
+    identity.
+    """
+    denoise = RTCProcessor.denoise_step
+
+    def denoise_with_gradient(self: Any, **options: Any) -> Any:
+        step = options["original_denoise_step_partial"]
+        if options["prev_chunk_left_over"] is None:
+            return denoise(self, **options)
+        connect = {"original_denoise_step_partial": lambda noisy: step(noisy.requires_grad_())}
+        return denoise(self, **{**options, **connect})
+
+    monkeypatch.setattr(RTCProcessor, "denoise_step", denoise_with_gradient)
 
 
 def view(seed: int = 0, side: int = tiny.SIDE, **info: Any) -> Obs:

@@ -126,6 +126,7 @@ def test_a_session_gets_the_same_in_any_company(kind: str, made: Callable[[str],
 
 
 @pytest.mark.verifies("parity")
+@pytest.mark.usefixtures("connected")
 @pytest.mark.parametrize("delay", [None, 2])
 @pytest.mark.parametrize("kind", KINDS)
 def test_flow_matching_and_its_guidance_are_theirs(
@@ -184,6 +185,7 @@ def test_in_bfloat16_the_error_is_that_of_lerobots_own_passes(
 
 @pytest.mark.skipif(not tiny.NEW, reason="LeRobot 0.4 has no relative actions")
 @pytest.mark.verifies("parity")
+@pytest.mark.usefixtures("connected")
 def test_actions_relative_to_the_state_and_their_leftovers_are_theirs(
     made: Callable[[str], Path], tmp_path: Path
 ) -> None:

@@ -36,6 +36,7 @@ def trained(shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
     return folder / "pi05"
 
 
+@pytest.mark.usefixtures("connected")
 @pytest.mark.parametrize("mode", ["trained", "guided"])
 @pytest.mark.parametrize("delay", [1, LONGEST])
 def test_actions_after_prefixes_are_theirs(delay: int, mode: str, trained: Path) -> None:

@@ -65,6 +65,18 @@ def test_a_chunk_continues_the_plan_of_the_robot(loaded: Load) -> None:
     assert np.abs(guided[:3] - plan[:3]).max() < 0.2 * np.abs(free[:3] - plan[:3]).max()
 
 
+@pytest.mark.parametrize("kind", ["smolvla"])
+def test_without_a_delay_actions_are_bit_identical_to_those_without_a_plan(
+    kind: str, loaded: Load
+) -> None:
+    policy = loaded(kind, execute=tiny.CHUNK)
+    plan = begun(policy, 5).act(view(5)).action
+    free, unguided = (
+        begun(policy).act(view(**info)).action for info in ({}, {LEFTOVER: plan, DELAY: 0})
+    )
+    np.testing.assert_array_equal(free, unguided)
+
+
 def test_the_settings_of_the_guidance_can_be_overridden(made: Made) -> None:
     settings = {
         "execution_horizon": 4,
@@ -127,7 +139,7 @@ def prefixed(made: Made, monkeypatch: pytest.MonkeyPatch) -> LeRobot:
 
 def test_a_checkpoint_trained_with_prefixes_continues_them(prefixed: LeRobot) -> None:
     plan = np.random.default_rng(5).uniform(-1, 1, (6, tiny.ACTION)).astype(np.float32)
-    prefix_rows = {0: LONGEST, 2: 2, 5: LONGEST}  # by the delay, of which 0 is not known yet
+    prefix_rows = {0: 0, 2: 2, 5: LONGEST}  # by the delay
     views = [view(0, **{LEFTOVER: plan, DELAY: delay}) for delay in prefix_rows]
     acts = prefixed.act_batch([*views, view(0)], [begun(prefixed, i) for i in range(4)])
     scale = tiny.statistics()["action"]["std"]
