@@ -208,7 +208,7 @@ def test_two_relative_rotations_are_joined_in_the_order_of_their_frame(
 
     pose = columns.still(rows[0])
     for row in rows:
-        pose = columns.executed(pose, row)
+        pose = columns.joined(pose, row)
     assert angle_between(rotation_in(kind, pose), expected) < TOLERANCE
 
 
@@ -280,7 +280,7 @@ def test_no_motion_keeps_every_target(data: st.DataObject) -> None:
     if delta:
         assert not any(columns.motion(still.tolist(), still.tolist()))
         pose = columns.moved(still, data.draw(st.lists(COMPONENTS, min_size=dim, max_size=dim)))
-        executed = columns.executed(pose, still)
+        executed = columns.joined(pose, still)
         for rotation in columns.rotations:
             part = slice(rotation.start, rotation.stop)
             before, after = matrix_of(kind, pose[part]), matrix_of(kind, executed[part])

@@ -193,19 +193,118 @@ class Columns:
         return same
 
     def joined(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return the command that moves the robot as `first` and then `second` do, (D,) float32."""
+        """Return the command that moves the robot as `first` and then `second` do, (D,) float32;
+        or the pose after a row.
+
+        In the frame of the tool, the first rotation also turns the second translation. If the
+        numbers of the rotation have a factor, its angle is unknown, and the translations are added,
+        which is right to first order.
+
+        Args:
+            first: A row, (D,), or the pose at which the robot executes `second`.
+            second: A row, (D,), whose targets are those of the result.
+        """
         row = np.array(second, np.float32)
         columns = list(self.relative)
         row[columns] = first[columns] + second[columns]
+        for rotation in self._composed():
+            part = slice(rotation.start, rotation.stop)
+            numbers = first[part].tolist()
+            begin = _read(rotation.kind, numbers)
+            turn = _read(rotation.kind, second[part].tolist())
+            product = (begin, turn) if rotation.is_of_tool else (turn, begin)
+            row[part] = _write(rotation.kind, _product(*product), numbers)
+            place = self._translation(rotation)
+            if place is not None:
+                row[place] = first[place] + _rotated(begin, second[place].tolist())
+        return row
+
+    def reversed(self, row: np.ndarray) -> np.ndarray:
+        """Return the row that moves the robot back after a row, (D,) float32.
+
+        Its targets are those of the row.
+        """
+        back = np.array(row, np.float32)
+        columns = list(self.relative)
+        back[columns] = -row[columns]
+        for rotation in self._composed():
+            part = slice(rotation.start, rotation.stop)
+            turn = _inverse(_read(rotation.kind, row[part].tolist()))
+            back[part] = _write(rotation.kind, turn, _IDENTITIES[rotation.kind])
+            place = self._translation(rotation)
+            if place is not None:
+                back[place] = _rotated(turn, back[place].tolist())
+        return back
+
+    def remaining(self, whole: np.ndarray, executed: np.ndarray) -> np.ndarray:
+        """Return the way that is left of a motion after another motion was executed, (D,) float32.
+
+        Args:
+            whole: The motion, (D,).
+            executed: The executed motion, (D,).
+        """
+        if any(True for _ in self._composed()):
+            return self.joined(self.reversed(executed), whole)
+        left: np.ndarray = whole - executed
+        return left
+
+    def reach(self, rows: np.ndarray) -> np.ndarray:
+        """Return the largest motion of each column in rows, (D,) float32; 0 for targets.
+
+        The motion of a rotation, in all its columns, is its angle, rad, unless its numbers have a
+        factor.
+
+        Args:
+            rows: (H, D).
+
+        Raises:
+            InvalidAction: Numbers of a row are no rotation.
+        """
+        reach = np.zeros(self.dim, np.float32)
+        columns = list(self.relative)
+        reach[columns] = np.abs(rows[:, columns]).max(0)
+        for rotation in self._composed():
+            part = slice(rotation.start, rotation.stop)
+            reach[part] = max(_angle(rotation.kind, numbers) for numbers in rows[:, part].tolist())
+        return reach
+
+    def limited(self, row: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Return a row with its motions within bounds, (D,) float32.
+
+        Args:
+            row: (D,).
+            low: The lower bounds, (D,). Those of rotations are not used, unless the numbers of the
+                rotation have a factor.
+            high: The upper bounds, (D,). That of a rotation, in its first column, is for its angle,
+                rad, unless its numbers have a factor.
+        """
+        limited = np.array(row, np.float32)
+        columns = list(self.relative)
+        limited[columns] = np.clip(row[columns], low[columns], high[columns])
+        for rotation in self._composed():
+            part = slice(rotation.start, rotation.stop)
+            largest = float(high[rotation.start])
+            numbers = row[part].tolist()
+            angle = _angle(rotation.kind, numbers)
+            if angle > largest:
+                numbers = _fraction(rotation, numbers, largest / angle)
+            limited[part] = numbers
+        return limited
+
+    def _composed(self) -> Iterator[RotationColumns]:
+        """Yield the relative rotations whose products, not sums, are rotations."""
         for rotation in self.rotations:
             if rotation.is_relative and not rotation.is_linear:
-                part = slice(rotation.start, rotation.stop)
-                numbers = second[part].tolist()
-                one = _read(rotation.kind, first[part].tolist())
-                other = _read(rotation.kind, numbers)
-                product = (one, other) if rotation.is_of_tool else (other, one)
-                row[part] = _write(rotation.kind, _product(*product), numbers)
-        return row
+                yield rotation
+
+    def _translation(self, rotation: RotationColumns) -> slice | None:
+        """Return the columns of the translation that a rotation about the axes of the tool turns;
+        None if there are none.
+        """
+        columns = range(rotation.start - 3, rotation.start)
+        if rotation.is_of_tool and all(column in self.relative for column in columns):
+            return slice(columns.start, columns.stop)
+        return None
 
     def mean(self, rows: Sequence[np.ndarray], weights: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return the weighted mean of rows for the same tick, (D,) float32.
@@ -281,23 +380,6 @@ class Columns:
                 turned = _product(turn, _read(rotation.kind, numbers))
                 row[start:stop] = _write(rotation.kind, turned, numbers)
         return row.astype(np.float32)
-
-    def executed(self, pose: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Return the pose after a row, (D,) float32: its targets, and the pose's columns moved by
-        its motions.
-        """
-        after = np.array(row, np.float32)
-        columns = list(self.relative)
-        after[columns] = pose[columns] + row[columns]
-        for rotation in self.rotations:
-            if rotation.is_relative and not rotation.is_linear:
-                part = slice(rotation.start, rotation.stop)
-                numbers = pose[part].tolist()
-                before = _read(rotation.kind, numbers)
-                turn = _read(rotation.kind, row[part].tolist())
-                product = (before, turn) if rotation.is_of_tool else (turn, before)
-                after[part] = _write(rotation.kind, _product(*product), numbers)
-        return after
 
     def require_rotations(self, row: Sequence[float]) -> None:
         """Raise `InvalidAction` if numbers of a row are no rotation, such as a zero quaternion."""
@@ -667,6 +749,18 @@ def _from_vector(vector: Sequence[float]) -> _Quaternion:
     angle = math.hypot(x, y, z)
     factor = math.sin(angle / 2) / angle if angle else 0.5
     return math.cos(angle / 2), factor * x, factor * y, factor * z
+
+
+def _rotated(rotation: _Quaternion, vector: Sequence[float]) -> list[float]:
+    """Return a vector, turned by a rotation."""
+    x, y, z = vector
+    _, *turned = _product(_product(rotation, (0.0, x, y, z)), _inverse(rotation))
+    return turned
+
+
+def _angle(kind: Rotation, numbers: Sequence[float]) -> float:
+    """Return the angle of a rotation, rad, at most pi."""
+    return math.hypot(*_turn(kind, _IDENTITIES[kind], numbers))
 
 
 def _turn(kind: Rotation, before: Sequence[float], after: Sequence[float]) -> list[float]:

@@ -180,7 +180,9 @@ def test_nothing_changes_by_itself_in_real_time(arm: Arm, meanwhile: str) -> Non
     random = np.random.default_rng(ARMS.index(arm))
     clock = ClockConfig(latency="measured", meanwhile=meanwhile)  # type: ignore[arg-type]
     env = Contract(action=arm.spec, control_hz=10)
-    neutral = [0.0] * arm.dim
+    neutral = arm.columns.still().tolist()
+    for rotation in arm.columns.rotations:
+        neutral[rotation.start : rotation.stop] = IDENTITY[arm.rotation]
     if len(arm.columns.absolute) > arm.arms:
         with pytest.raises(ConfigError, match=r"clock\.neutral"):
             ChunkExecutor(None, clock, env)

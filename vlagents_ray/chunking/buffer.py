@@ -8,12 +8,13 @@ sessions all use this buffer.
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -59,6 +60,23 @@ https://arxiv.org/abs/2304.13705) and in `temporal_agg` of their code.
 """
 
 
+# The number of motions that a plan remembers, more than an answer has rows. An answer from before
+# them is too late: the way of the robot since its observation is unknown. There are more only if an
+# operator moves the robot while the server is silent.
+_REMEMBERED = 4096
+# The sum of the parts of a row of float32 numbers differs from the row by this share of it.
+_ROUNDING = 1e-6
+
+
+class Origin(NamedTuple):
+    """The pose of the robot at an observation, as a position in the motions of a plan."""
+
+    motions: int  # the number of motions before the observation
+    # The part of the next row, (D,), that was executed before the observation in an ease-in, which
+    # divides rows; None if there is none.
+    part: np.ndarray | None = None
+
+
 class Chunk(NamedTuple):
     """A chunk of actions in an answer of the policy."""
 
@@ -71,6 +89,8 @@ class Chunk(NamedTuple):
     info: Mapping[str, Any] = {}
     tick: int = 0  # the tick of the observation
     seen_at: float = 0.0  # capture time of the observation, s of `time.monotonic`
+    # `ChunkBuffer.origin` at the observation; None: the pose before the action of `step`.
+    origin: Origin | None = None
 
     @property
     def end(self) -> int:
@@ -84,6 +104,8 @@ class Step(NamedTuple):
     action: np.ndarray  # (D,) float32
     chunk: Chunk  # newest chunk with a row for this step
     row: int  # index of the row in that chunk
+    # Whether the action contains a part of the way back to the path of a chunk.
+    is_corrected: bool = False
 
     def with_action(self, action: np.ndarray, tick: int, silent_s: float) -> Act:
         """Return `action` in place of the planned action of a tick, with the info of the planned
@@ -102,6 +124,25 @@ class Step(NamedTuple):
         return Act(action.copy(), done, {**chunk.info, **chunk_info})
 
 
+@dataclass(slots=True)
+class _Planned:
+    """A chunk of a plan, and the way from the robot to the path of the chunk."""
+
+    chunk: Chunk
+    counted: int  # the number of motions of the plan that `way` takes into account
+    # The way from the robot to the pose that the chunk's rows up to now reach from the pose of its
+    # observation, (D,); None if the robot is at this pose.
+    way: np.ndarray | None
+
+
+class _Motion(NamedTuple):
+    """A motion of the robot."""
+
+    action: np.ndarray  # (D,) float32
+    # `ChunkBuffer.executed` before it; None if it was not executed in place of a row of the plan.
+    step: int | None
+
+
 class ChunkBuffer:
     """The chunks of a plan, positioned by the number of actions that the robot had executed at
     their observation.
@@ -112,10 +153,19 @@ class ChunkBuffer:
     were counted instead, the rows after a stall would begin ahead of the robot's position: absolute
     targets would make the robot jump, and relative targets would omit a part of the path.
     (LeRobot's real-time chunking has the same rule since huggingface/lerobot#4454.)
-    """
 
-    action: ActionSpec
-    """The actions of the contract; the mean of rows depends on their columns."""
+    *Anchored rows*: a row of motions stands for the pose that the rows of its chunk up to it reach
+    from the pose of the observation, and is executed as the way from the robot's pose to that pose.
+    Otherwise, the rows of a late answer would begin where the rows of earlier chunks have led the
+    robot, and no row would correct the difference. Only motions of a contract that declares what
+    its actions are have an anchor; targets need none. The buffer keeps the way from the robot to
+    the path of each chunk. While the robot executes all rows of a chunk unchanged, there is no way
+    back to its path, and its rows are executed bit by bit.
+
+    A corrected motion is within the limits of the contract and of the guard. If there are none, it
+    is at most as large as the largest motion of the plan, since the robot's speed is only known
+    from the policy. The rest of the correction is left to the next rows.
+    """
 
     def __init__(
         self,
@@ -130,18 +180,67 @@ class ChunkBuffer:
                 `MERGES`, "ensemble", or a function that is folded over the rows from the oldest
                 chunk to the newest.
             ensemble_m: The m of the ensemble's weights exp(-m * i), oldest first.
-            action: The actions of the contract, if it is known.
+            action: The actions of the contract, if it is known; see `describe`.
         """
         if isinstance(merge, str) and merge not in MERGES and merge != ENSEMBLE:
             raise ConfigError(
                 f"merge: expected one of {sorted([*MERGES, ENSEMBLE])} or a function, got {merge!r}"
             )
         self.executed = 0  # the number of executed actions of this plan
-        self.action = action or ActionSpec()
         self._merge = MERGES.get(merge) if isinstance(merge, str) else merge  # None: the ensemble
         self._newest = merge == "newest"
         self._m = ensemble_m
-        self._chunks: deque[Chunk] = deque()
+        self.describe(action or ActionSpec())
+
+    def describe(
+        self,
+        action: ActionSpec,
+        arm: ActionSpec | None = None,
+        *,
+        bounds: tuple[float | np.ndarray | None, float | np.ndarray | None] = (None, None),
+    ) -> None:
+        """Begin a plan without chunks, of actions with another meaning.
+
+        Args:
+            action: The actions of the contract.
+            arm: The actions of the arm's contract, which may declare further grippers.
+            bounds: The lower and the upper bound of the guard, for all numbers or (D,) each.
+        """
+        self._spec, self._arm, self._guard_bounds = action, arm, bounds
+        self._step: Step | None = None  # `next`, once it is computed
+        self._columns: Columns | None = None  # the meaning of the columns; None before any action
+        self._is_anchored = False
+        self._chunks: deque[_Planned] = deque()
+        self._forgotten = 0  # the number of motions before those in `_motions`
+        # The motions since the oldest observation that matters.
+        self._motions: list[_Motion] = []
+        self._observed: int | None = None  # motions before the observation of the last request
+        self._part: np.ndarray | None = None  # see `Origin.part`
+        # The bounds of all numbers, and those of motions only, (D,).
+        self._low = self._high = self._least = self._most = np.zeros(0, np.float32)
+        self._reach = np.zeros(0, np.float32)  # the largest motions of the plan, (D,)
+
+    def _set_columns(self, dim: int) -> Columns:
+        """Set the meaning of the columns of actions with `dim` numbers, and return it."""
+        columns = self._columns
+        if columns is not None and columns.dim == dim:
+            return columns
+
+        self._columns = columns = Columns.from_spec(self._spec, dim, self._arm)
+        self._is_anchored = columns.is_known and bool(columns.relative)
+        guard_low, guard_high = self._guard_bounds
+        self._low = _strictest(np.maximum, -math.inf, dim, self._spec.low, guard_low)
+        self._high = _strictest(np.minimum, math.inf, dim, self._spec.high, guard_high)
+        self._reach = np.zeros(dim, np.float32)
+
+        is_bounded = np.zeros(dim, bool)
+        is_bounded[list(columns.relative)] = True
+        for rotation in columns.rotations:
+            # Only numbers that are proportional to the motion have its bounds.
+            is_bounded[list(rotation.columns)] &= rotation.is_linear
+        self._least = np.where(is_bounded, self._low, np.float32(-math.inf))
+        self._most = np.where(is_bounded, self._high, np.float32(math.inf))
+        return columns
 
     def add(self, chunk: Chunk) -> bool:
         """Add a chunk; return False if it has no row left to execute, or arrived too late
@@ -149,38 +248,128 @@ class ChunkBuffer:
 
         If the last row is the only row left, it may be executed one step late: an answer with a
         single action has no other row, and arrives after the previous action was executed.
+
+        Raises:
+            InvalidAction: The contract declares relative rotations, and a row has numbers that are
+                no rotation.
         """
-        while self._chunks and self._chunks[0].end <= self.executed:
+        while self._chunks and self._chunks[0].chunk.end <= self.executed:
             self._chunks.popleft()
 
         if self.outruns(chunk.step, chunk.info):
             return False
+        origin = chunk.origin or self._before(chunk.step)
         if chunk.end == self.executed and self.next is None:
             chunk = chunk._replace(step=chunk.step + 1)
-        if chunk.end <= self.executed:
+        if chunk.end <= self.executed or origin.motions < self._forgotten:
             return False
-        self._chunks.append(chunk)
+
+        columns = self._set_columns(chunk.rows.shape[1])
+        if self._is_anchored:
+            self._reach = np.maximum(self._reach, columns.reach(chunk.rows))
+        self._chunks.append(_Planned(chunk, origin.motions, origin.part))
+        self._step = None
+        self._observed = None
+        self._forget(min(planned.counted for planned in self._chunks))
         return True
+
+    def origin(self) -> Origin:
+        """Return the pose of the robot now, for the chunk that answers an observation of now.
+
+        The motions since then are remembered until this chunk is added.
+        """
+        self._observed = self._forgotten + len(self._motions)
+        return Origin(self._observed, self._part)
 
     @property
     def next(self) -> Step | None:
         """The step to execute now; None if no chunk has a row for it."""
-        return self._at(self.executed)
+        step = self._step
+        if step is None:
+            step = self._step = self._next(is_anchored=self._is_anchored)
+        return step
+
+    @property
+    def uncorrected(self) -> Step | None:
+        """`next` as if the robot were on the paths of all chunks."""
+        return self._next(is_anchored=False)
 
     @property
     def after(self) -> np.ndarray | None:
         """The action after `next`, (D,); None if no chunk has a row for it."""
-        step = self._at(self.executed + 1)
+        ahead = self._ahead()
+        ahead.advance()
+        step = ahead.next
         return None if step is None else step.action
 
     @property
     def known(self) -> int:
         """The number of actions from `next` to the end of the plan."""
-        return max((chunk.end for chunk in self._chunks), default=self.executed) - self.executed
+        ends = (planned.chunk.end for planned in self._chunks)
+        return max(ends, default=self.executed) - self.executed
 
-    def advance(self) -> None:
-        """Count `next`, or an action that replaces it, as executed."""
+    def advance(self, action: np.ndarray | None = None) -> None:
+        """Count `next`, or an action that replaces it, as executed.
+
+        Args:
+            action: The action that was sent to the robot, (D,); None: `next`, or no motion if there
+                is no `next`.
+        """
+        step = self._step
+        if action is None:
+            step = self.next
+            action = None if step is None else step.action
+        if action is not None and (self._is_anchored or self._columns is None):
+            self._set_columns(len(action))
+        if action is not None and self._is_anchored:
+            self.settle()
+            self._record(action, self.executed)
+
+            # A row that was executed unchanged adds nothing to the way to its chunk's path.
+            if self._newest and step is not None and action is step.action:
+                newest = self._chunks[-1]
+                if newest.chunk is step.chunk and not step.is_corrected:
+                    newest.counted = self._forgotten + len(self._motions)
         self.executed += 1
+        self._step = None
+
+    def move(self, action: np.ndarray) -> None:
+        """Count the motion of an action that replaces no row of the plan, such as a safe action.
+
+        Args:
+            action: The action that was sent to the robot, (D,).
+        """
+        self._set_columns(len(action))
+        if self._is_anchored and self._moves(action):
+            self.settle()
+            self._record(action, None)
+
+    def ease(self, action: np.ndarray, *, completes: bool) -> None:
+        """Count an action that executes a part of `next`, which remains the whole row until it is
+        complete.
+
+        Args:
+            action: The action that was sent to the robot, (D,). If it completes the row, it may
+                contain a part of the row after it.
+            completes: Whether it completes the row.
+        """
+        step = self.next
+        if self._is_anchored and step is not None:
+            columns = self._set_columns(len(action))
+            part = action if self._part is None else columns.joined(self._part, action)
+            if completes:
+                self._record(step.action, self.executed)
+                part = columns.remaining(part, step.action)
+            self._part = part
+        if completes:
+            self.executed += 1
+            self._step = None
+
+    def settle(self) -> None:
+        """End an ease-in: `next` is the part of its row that is left."""
+        part, self._part = self._part, None
+        if part is not None and self._moves(part):
+            self._record(part, None)
 
     def take(self) -> Step:
         """Return `next` and count it as executed; raises `PolicyFailed` if no chunk has a row for
@@ -189,28 +378,42 @@ class ChunkBuffer:
         step = self.next
         if step is None:
             raise PolicyFailed(f"chunk: no row is left for step {self.executed} of the plan")
-        self.advance()
+        self.advance(step.action)
         return step
 
-    def replace(self, rows: np.ndarray, step: int | None = None, tick: int = 0) -> None:
+    def replace(
+        self,
+        rows: np.ndarray,
+        step: int | None = None,
+        tick: int = 0,
+        origin: Origin | None = None,
+    ) -> None:
         """Replace all chunks with a single chunk.
 
         Args:
             rows: Its rows, (H, D).
             step: The step of its first row; None: the next step.
             tick: The tick of its observation.
+            origin: `origin` at its observation; None: the pose before the action of `step`.
         """
         self._chunks.clear()
-        self.add(Chunk(0, self.executed if step is None else step, rows, tick=tick))
+        self._step = None
+        first = self.executed if step is None else step
+        self.add(Chunk(0, first, rows, tick=tick, origin=origin))
 
     def leftover(self) -> np.ndarray | None:
-        """Return the remaining actions, (H', D); None if there are none."""
+        """Return the remaining actions as the robot will execute them, (H', D); None if there are
+        none.
+
+        They are within the limits of the contract and of the guard. Otherwise, a policy that
+        continues them would amplify its own numbers from request to request.
+        """
         rows: list[np.ndarray] = []
-        step = self._at(self.executed)
-        while step is not None:
+        ahead = self._ahead()
+        while (step := ahead.next) is not None:
             rows.append(step.action)
-            step = self._at(self.executed + len(rows))
-        return np.stack(rows) if rows else None
+            ahead.advance(step.action)
+        return np.clip(np.stack(rows), self._low, self._high) if rows else None
 
     def continuation(self, delay: int) -> dict[str, Any]:
         """Return the `Obs.info` of a request with real-time chunking.
@@ -237,47 +440,141 @@ class ChunkBuffer:
         whether any chunk was dropped.
         """
         count = len(self._chunks)
-        self._chunks = deque(chunk for chunk in self._chunks if chunk.seen_at >= before)
+        kept = (planned for planned in self._chunks if planned.chunk.seen_at >= before)
+        self._chunks = deque(kept)
+        self._step = None
+        if not self._chunks:
+            self.settle()
+            self._reach = np.zeros_like(self._reach)
         return len(self._chunks) < count
 
-    def _at(self, index: int) -> Step | None:
-        """Return the step with this index in the plan; None if no chunk has a row for it."""
+    def _next(self, *, is_anchored: bool) -> Step | None:
+        """Return the step to execute now, with or without the ways to the paths of the chunks."""
+        index = self.executed
         for newest in reversed(self._chunks):
-            if newest.step <= index < newest.end:
+            if newest.chunk.step <= index < newest.chunk.end:
                 break
         else:
             return None
 
-        row = index - newest.step
-        if self._newest:
-            return Step(newest.rows[row], newest, row)
+        planned = [newest]
+        if not self._newest:
+            planned = [one for one in self._chunks if one.chunk.step <= index < one.chunk.end]
+        rows = [one.chunk.rows[index - one.chunk.step] for one in planned]
+        newest_row = rows[-1]
+        has_way = False
+        if is_anchored:
+            columns = self._set_columns(len(newest_row))
+            for number, one in enumerate(planned):
+                self._update(one)
+                if one.way is not None:
+                    rows[number] = columns.joined(one.way, self._possible(rows[number]))
+                    has_way = True
 
-        chunks = (chunk for chunk in self._chunks if chunk.step <= index < chunk.end)
-        rows = [chunk.rows[index - chunk.step] for chunk in chunks]
+        action = self._merged(rows)
+        if has_way:
+            action = self._limited(action, newest_row)
+        return Step(action, newest.chunk, index - newest.chunk.step, has_way)
+
+    def _merged(self, rows: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the action of the rows of several chunks for a step, oldest first, (D,)."""
         if len(rows) == 1:
-            action = rows[0]
-        elif callable(self._merge):
-            action = np.asarray(functools.reduce(self._merge, rows), np.float32)
-        else:
-            action = self._mean(rows, self._merge)
-        return Step(action, newest, row)
-
-    def _mean(self, rows: Sequence[np.ndarray], newer: float | None) -> np.ndarray:
-        """Return the mean of the rows of several chunks for a step, oldest first, (D,) float32.
-
-        Args:
-            rows: The rows, (D,) each.
-            newer: The weight of each newer row in the mean with the older ones; None for the
-                weights of the ensemble.
-        """
-        columns = Columns.from_spec(self.action, len(rows[0]))
-        if newer is None:
+            return rows[0]
+        if callable(self._merge):
+            return np.asarray(functools.reduce(self._merge, rows), np.float32)
+        columns = self._set_columns(len(rows[0]))
+        if self._merge is None:
             weights = np.exp(-self._m * np.arange(len(rows)))
             return columns.mean(rows, weights)
         mean = rows[0]
         for row in rows[1:]:
-            mean = columns.mean([mean, row], [1.0 - newer, newer])
+            mean = columns.mean([mean, row], [1.0 - self._merge, self._merge])
         return mean
+
+    def _limited(self, action: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """Return a corrected action within the limits of motions, (D,).
+
+        Args:
+            action: The action, (D,).
+            row: The row of the newest chunk, (D,). Its numbers beyond the limits are not corrected,
+                so that the guard rejects them.
+        """
+        columns = self._set_columns(len(row))
+        low = np.where(np.isfinite(self._least), self._least, -self._reach)
+        high = np.where(np.isfinite(self._most), self._most, self._reach)
+        limited = columns.limited(action, low, high)
+        is_beyond = (row < self._least) | (row > self._most)
+        limited[is_beyond] = row[is_beyond]
+        return limited
+
+    def _update(self, planned: _Planned) -> None:
+        """Count the motions since the last update in the way to the path of a chunk."""
+        chunk = planned.chunk
+        for motion in self._motions[planned.counted - self._forgotten :]:
+            columns = self._set_columns(len(motion.action))
+            executed = self._possible(motion.action)
+            goal = planned.way  # the pose that the chunk reaches, from the robot before the motion
+            if motion.step is not None and chunk.step <= motion.step < chunk.end:
+                row = self._possible(chunk.rows[motion.step - chunk.step])
+                goal = row if goal is None else columns.joined(goal, row)
+            elif goal is None:
+                goal = columns.still(executed)
+
+            is_there = (goal == executed)[list(columns.relative)].all()
+            planned.way = None if is_there else columns.remaining(goal, executed)
+        planned.counted = self._forgotten + len(self._motions)
+
+    def _possible(self, row: np.ndarray) -> np.ndarray:
+        """Return the motions of a row that the contract allows, which a robot does not exceed."""
+        possible: np.ndarray = np.minimum(np.maximum(row, self._least), self._most)
+        return possible
+
+    def _moves(self, action: np.ndarray) -> bool:
+        """Return whether an action is a motion, up to rounding."""
+        columns = self._set_columns(len(action))
+        return bool((columns.reach(action[np.newaxis]) > _ROUNDING * self._reach).any())
+
+    def _record(self, action: np.ndarray, step: int | None) -> None:
+        """Remember a motion; see `_Motion`."""
+        self._motions.append(_Motion(action, step))
+        self._step = None
+        if len(self._motions) > _REMEMBERED:
+            for planned in self._chunks:
+                self._update(planned)
+            self._observed = None
+            self._forget(self._forgotten + _REMEMBERED // 2)
+
+    def _forget(self, count: int) -> None:
+        """Forget the first `count` motions, except those since the last request."""
+        count = count if self._observed is None else min(count, self._observed)
+        del self._motions[: count - self._forgotten]
+        self._forgotten = count
+
+    def _before(self, step: int) -> Origin:
+        """Return the pose of the robot before the action of a step."""
+        for number, motion in enumerate(self._motions, self._forgotten):
+            if motion.step is not None and motion.step >= step:
+                return Origin(number)
+        return Origin(self._forgotten + len(self._motions))
+
+    def _ahead(self) -> ChunkBuffer:
+        """Return a copy of the plan, which may be executed while this one stays as it is."""
+        ahead = copy.copy(self)
+        ahead._chunks = deque(replace(planned) for planned in self._chunks)
+        ahead._motions = list(self._motions)
+        ahead._part = None  # the rows of an ease-in remain whole
+        return ahead
+
+
+def _strictest(
+    stricter: np.ufunc, none: float, dim: int, *bounds: float | np.ndarray | None
+) -> np.ndarray:
+    """Return the strictest of bounds for each number, (dim,) float32; `none` without bounds."""
+    strictest = np.full(dim, none, np.float32)
+    for bound in bounds:
+        if bound is not None and np.shape(bound) in ((), (dim,)):  # the guard rejects other shapes
+            strictest = stricter(strictest, np.asarray(bound, np.float32))
+    return strictest
 
 
 # The number of answers that may include a cold start: the first answers that continue a plan may

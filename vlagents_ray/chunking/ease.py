@@ -91,6 +91,11 @@ class EaseIn:
             return self._full_rows == _FULL_ROWS or self._tick > self._latest_tick
         return self.arrived and self._ticks == 0 and self._is_full(self._speed)
 
+    @property
+    def divides_rows(self) -> bool:
+        """Whether a row is complete when all of its motion has been executed."""
+        return self._counts_shares or not self.catches_up
+
     def step(
         self, last: np.ndarray, action: np.ndarray, after: np.ndarray | None, known: int
     ) -> tuple[np.ndarray, int]:

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from vlagents_ray.chunking.buffer import ChunkBuffer
+from vlagents_ray.chunking.buffer import ChunkBuffer, Step
 from vlagents_ray.chunking.ease import EaseIn
 from vlagents_ray.columns import Columns
 from vlagents_ray.contract import ActionSpec, Contract
@@ -219,6 +219,7 @@ class Motion:
         self._ease: EaseIn | None = None  # the ease-in, while a motion begins from rest
         self._last: np.ndarray | None = None  # the last commanded action
         self._before: np.ndarray | None = None  # last commanded action of earlier ticks
+        self._is_corrected = False  # whether the last command was corrected; see `ChunkBuffer`
         self._state: Literal["stopped", "moving", "held"] = "stopped"
 
     @property
@@ -269,7 +270,7 @@ class Motion:
 
     def follow(self, plan: ChunkBuffer, obs: Obs) -> tuple[np.ndarray, int]:
         """Return the next command of a plan, (D,) float32, and the number of rows that it
-        completes.
+        completes, and count it in the plan.
 
         If the robot is at rest, the check's `ease_in` first leads it onto the plan, whose rows wait
         meanwhile.
@@ -282,9 +283,11 @@ class Motion:
             InvalidAction: The command must not be sent.
             PolicyFailed: The plan has no next row.
         """
-        if plan.next is None:
+        self._settle(plan)
+        step = plan.next
+        if step is None:
             raise PolicyFailed(f"plan: expected a row for step {plan.executed}, got none")
-        action = plan.next.action
+        action = step.action
 
         ease_in = getattr(self._check, "ease_in", None)
         if self._state != "moving" and ease_in is not None:
@@ -295,13 +298,71 @@ class Motion:
 
         ease = self._ease
         if ease is None or ease.over:
-            return self.move(action, obs), 1
+            command = self._execute(plan, step, obs)
+            plan.advance(command)
+            return command, 1
+
         last = self._last
         if last is None:  # The rows have only motions.
             last = Columns.from_spec(self._spec, len(action), self._arm).still(action)
         command, rows = ease.step(last, action, plan.after, plan.known)
-        self._last = self._checked(command, self._last)
-        return self._last, rows
+        command = self._checked_part(step, command)
+        self._last = command
+        if ease.divides_rows:
+            plan.ease(command, completes=bool(rows))
+        else:
+            plan.advance(command)
+        self._settle(plan)
+        return command, rows
+
+    def _settle(self, plan: ChunkBuffer) -> None:
+        """Settle the plan unless an ease-in divides its rows."""
+        if self._ease is None or self._ease.over:
+            plan.settle()
+
+    def _execute(self, plan: ChunkBuffer, step: Step, obs: Obs) -> np.ndarray:
+        """Return the command for the next step of a plan.
+
+        A row that the check allows must not be rejected because it was corrected, as the plan would
+        be dropped. The command is then corrected as far as the check allows.
+
+        Raises:
+            InvalidAction: The command must not be sent.
+        """
+        was_corrected, self._is_corrected = self._is_corrected, step.is_corrected
+        if not was_corrected and not step.is_corrected:
+            return self.move(step.action, obs)
+        try:
+            return self.move(step.action, obs)
+        except InvalidAction:
+            uncorrected = plan.uncorrected
+            row = step.action if uncorrected is None else uncorrected.action
+            nearest = getattr(self._check, "nearest", None)
+            if nearest is None or self._state != "moving" or self._last is None:
+                if not step.is_corrected:
+                    raise
+                return self.move(row, obs)
+
+            allowed = nearest(step.action, self._last, row, brakes=was_corrected)
+            if allowed is None:
+                raise
+            self._is_corrected = True
+            return self.move(allowed, obs)
+
+    def _checked_part(self, step: Step, command: np.ndarray) -> np.ndarray:
+        """Return the checked command for a part of a step in an ease-in; see `_execute`."""
+        was_corrected, self._is_corrected = self._is_corrected, step.is_corrected
+        try:
+            return self._checked(command, self._last)
+        except InvalidAction:
+            nearest = getattr(self._check, "nearest", None)
+            if nearest is None or self._last is None or not (was_corrected or step.is_corrected):
+                raise
+            allowed = nearest(command, self._last, command, brakes=True)
+            if allowed is None:
+                raise
+            self._is_corrected = True
+            return self._checked(allowed, self._last)
 
     def hold(self, obs: Obs, why: Held) -> tuple[np.ndarray, Held]:
         """Return the action that keeps the robot still, (D,) float32, and the reason; raises

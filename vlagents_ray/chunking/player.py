@@ -23,6 +23,7 @@ from vlagents_ray.chunking.buffer import (
     DelayEstimate,
     Merge,
     Mode,
+    Origin,
     Step,
     stamped,
 )
@@ -145,6 +146,7 @@ class _Request(NamedTuple):
     # `ChunkBuffer.executed` at the request's observation: the position of the answer's first row.
     step: int = 0
     seen_at: float = 0.0  # capture time of the observation, s of `time.monotonic`
+    origin: Origin | None = None  # pose at the observation; None before the first request
 
 
 @dataclass(frozen=True)
@@ -410,8 +412,9 @@ class ChunkPlayer(Agent):
         if observes is not None:
             observes.observe(obs)
         if action is not None and self._tick is not None:
-            self._record_replacement(self._motion.move(action, obs))
-            self._plan.advance()
+            executed = self._motion.move(action, obs)
+            self._record_replacement(executed)
+            self._plan.advance(executed)
             self._tick += 1
 
     def act(self, obs: Obs) -> Act:
@@ -448,7 +451,7 @@ class ChunkPlayer(Agent):
         act = self._operator_act(obs)
         if SAFE not in act.info:  # The operator's action replaces a row.
             self._record_replacement(act.action)
-            self._plan.advance()
+            self._plan.advance(act.action)
         return act
 
     def close(self) -> None:
@@ -497,7 +500,8 @@ class ChunkPlayer(Agent):
         safe: SafeAction | None = None
         if self.settings.deadline_s is not None or self.control.leader is not None:
             safe = SafeAction(self.settings.safe, spec, self._arm)
-        self._plan.action = spec
+        bounds = getattr(self.check, "bounds", (None, None))
+        self._plan.describe(spec, self._arm, bounds=bounds)
         self._motion = Motion(self.check, self._contract, safe, self._arm)
 
     def _record_replacement(self, action: np.ndarray) -> None:
@@ -507,7 +511,8 @@ class ChunkPlayer(Agent):
 
     def _record_request(self, tick: int, obs: Obs) -> None:
         """Record that a request with this tick's observation is being sent."""
-        self._request = _Request(tick, self._plan.executed, self._captured(obs))
+        step, origin = self._plan.executed, self._plan.origin()
+        self._request = _Request(tick, step, self._captured(obs), origin)
         self._drops_answer = self._motion.keeps(self._plan)
 
     def _is_old(self, seen_at: float) -> bool:
@@ -600,8 +605,9 @@ class ChunkPlayer(Agent):
         if not act.done:
             rows = rows[: self.settings.horizon]
 
-        tick, step, seen_at = self._request
-        added = self._plan.add(Chunk(self._chunks, step, rows, act.done, info, tick, seen_at))
+        tick, step, seen_at, origin = self._request
+        chunk = Chunk(self._chunks, step, rows, act.done, info, tick, seen_at, origin)
+        added = self._plan.add(chunk)
         self._chunks += 1
         self._reason = WAITING if added else LATE
         self._begins_again = False
@@ -643,6 +649,7 @@ class ChunkPlayer(Agent):
             action = self._motion.move(action, obs)
         except InvalidAction as error:
             action, why = self._motion.hold(obs, refused(error))
+            self._plan.move(action)
             del info[INTERVENTION]  # the safe action is not an action of the operator
             info |= {SAFE: why.reason, CAUSE: why.cause}
             self._rebase_leader(action)
@@ -688,16 +695,15 @@ class ChunkPlayer(Agent):
                 act.info.update(timing)
                 self._ticks_of_rows += 1
                 self.rows += rows
-                if not rows:  # the command is still approaching the row
-                    return replace(act, done=False)
-                self._plan.advance()
-                return act
+                # Without a row, the command is still approaching it.
+                return act if rows else replace(act, done=False)
 
         if control_held is not None and self.control.running:  # the loop sends no command
             action = np.zeros(0, np.float32)
         else:
             try:
                 action, why = self._motion.hold(obs, why)
+                self._plan.move(action)
             except InvalidAction:
                 # The loop sends no command to a robot at rest without a safe action, for example if
                 # its grippers' openings are unknown.

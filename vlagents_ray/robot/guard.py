@@ -126,6 +126,13 @@ class Guard:
         if self._dim is not None:
             self._limits_of(self._dim)
 
+    @property
+    def bounds(self) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """The lower and the upper bound of an action, also those of the contract: a number, or
+        (D,); None for no bound.
+        """
+        return self._low, self._high
+
     def join(self, arm: ActionSpec) -> None:
         """Join the arm's description of its columns to the policy's.
 
@@ -283,15 +290,62 @@ class Guard:
             return 1.0
 
         # No motion is braking, which is always allowed.
-        allowed, too_far = 0.0, 1.0
-        for _ in range(_BISECTIONS):
-            share = 0.5 * (allowed + too_far)
+        def may_travel(share: float) -> bool:
             command = columns.travel(last, goal, 0.0, share)
-            if self._may_follow(columns, command.tolist(), last_numbers):
-                allowed = share
-            else:
-                too_far = share
-        return allowed
+            return self._may_follow(columns, command.tolist(), last_numbers)
+
+        return _largest(may_travel)
+
+    def nearest(
+        self, goal: np.ndarray, last: np.ndarray, row: np.ndarray, *, brakes: bool
+    ) -> np.ndarray | None:
+        """Return the action nearest to a corrected row of a plan that the guard allows.
+
+        Args:
+            goal: The corrected row, (D,).
+            last: The last command, (D,).
+            row: The row without the correction, (D,), at which the search begins.
+            brakes: Whether the search begins at a stop if the guard rejects the row, since the last
+                command was corrected. A row that is beyond the bounds, or too fast, remains
+                rejected.
+
+        Returns:
+            The action, (D,) float32; None if there is none.
+        """
+        columns = self._columns_of(len(goal))
+        last_numbers = last.tolist()
+        low, high, _, velocity, *_ = self._limits_of(len(goal))
+
+        def is_allowed(action: np.ndarray) -> bool:
+            numbers = action.tolist()
+            within = all(low[i] <= number <= high[i] for i, number in enumerate(numbers))
+            return within and self._may_follow(columns, numbers, last_numbers)
+
+        def corrected(share: float) -> np.ndarray:
+            action = columns.mean([row, goal], [1.0 - share, share])
+            targets = list(columns.absolute)
+            action[targets] = row[targets]
+            return action
+
+        if is_allowed(row):
+            return corrected(_largest(lambda share: is_allowed(corrected(share))))
+
+        speeds = self._sizes(columns.motion(row.tolist(), last_numbers))
+        is_fast = any(
+            speed > self._softness() * velocity[i] + 2 * _ROUNDING * abs(float(row[i]))
+            for i, speed in speeds
+        )
+        is_within = all(low[i] <= number <= high[i] for i, number in enumerate(row.tolist()))
+        if not brakes or is_fast or not is_within:
+            return None
+        start = last.copy()
+        at_once = self._at_once(columns)
+        start[at_once] = goal[at_once]
+
+        def braked(share: float) -> np.ndarray:
+            return columns.travel(start, goal, 0.0, share)
+
+        return braked(_largest(lambda share: is_allowed(braked(share))))
 
     def _may_follow(
         self, columns: Columns, numbers: list[float], last_numbers: list[float]
@@ -346,13 +400,8 @@ class Guard:
         if all(limit is None for limit in dynamic_limits):
             return None
 
-        # Grippers without limits jump to their position.
         *_, velocity, acceleration, jerk = self._limits_of(len(goal))
-        at_once = []
-        for i in columns.grippers:
-            if velocity[i] == acceleration[i] == jerk[i] == math.inf:
-                at_once.append(i)
-
+        at_once = self._at_once(columns)
         plan_speeds = self._plan_speeds(columns, goal if plan is None else plan)
         share = self._softness()
         ramp_ticks = 0.0
@@ -382,6 +431,15 @@ class Guard:
             ticks = max(1, ticks)
         even_ramp_ticks = 2 * math.ceil(ramp_ticks / 2)
         return EaseIn(columns, start, ticks, even_ramp_ticks, self._largest_share, at_once=at_once)
+
+    def _at_once(self, columns: Columns) -> list[int]:
+        """Return the columns of grippers without limits, which jump to their position."""
+        *_, velocity, acceleration, jerk = self._limits_of(columns.dim)
+        at_once = []
+        for i in columns.grippers:
+            if velocity[i] == acceleration[i] == jerk[i] == math.inf:
+                at_once.append(i)
+        return at_once
 
     def _check_first(
         self,
@@ -825,6 +883,18 @@ def _strictest(
             f"and the limits, got the shapes {shapes}; give one bound for each number of an action"
         )
     return functools.reduce(stricter, arrays) if arrays else None
+
+
+def _largest(is_allowed: Callable[[float], bool]) -> float:
+    """Return the largest allowed share of a way, in [0, 1], by bisection."""
+    allowed, too_far = 0.0, 1.0
+    for _ in range(_BISECTIONS):
+        share = 0.5 * (allowed + too_far)
+        if is_allowed(share):
+            allowed = share
+        else:
+            too_far = share
+    return allowed
 
 
 def _tolerant(limit: float) -> float:

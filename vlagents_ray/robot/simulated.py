@@ -85,7 +85,7 @@ class SimulatedRobot:
         """Set the targets of the joints, rad."""
         self.applied += 1
         self.stopped = False
-        self._target = self._columns.executed(self._target, action)
+        self._target = self._columns.joined(self._target, action)
 
     def stop(self) -> None:
         """Make the current position of the joints their target; the grippers keep their grasp."""

@@ -26,6 +26,7 @@ from vlagents_ray.interface import DELAY, GIVEN, LEFTOVER, Act, Agent, Obs
 
 RELATIVE = Contract(action=ActionSpec(dim=2, delta=True, gripper_open=1.0), control_hz=10.0)
 ABSOLUTE = Contract(action=ActionSpec(dim=2, delta=False), control_hz=10.0)
+LIMITED = Contract(action=replace(RELATIVE.action, low=-1.0, high=5.0), control_hz=10.0)
 # rows 1 to 6, with the gripper closed
 CHUNK = np.array([[i, -1.0] for i in range(1, 7)], np.float32)
 
@@ -43,13 +44,22 @@ def clock(**settings: Any) -> ClockConfig:
     ("execute", "settings", "env", "answers"),
     [
         # The first rows are dropped if the remaining rows of the last chunk were executed in their
-        # place.
-        (4, {}, RELATIVE, [(0.0, [1, 2, 3, 4]), (0.1, [5, 2, 3, 4]), (0.2, [5, 6, 3, 4])]),
+        # place. The next rows lead back to the path of the chunk, 1 + 2 + 3 + 4, no faster than the
+        # fastest row, or within the limits. A row beyond the limits, 6, is executed as 5.
+        (4, {}, RELATIVE, [(0.0, [1, 2, 3, 4]), (0.1, [5, -2, 3, 4]), (0.2, [5, 6, -5, 4])]),
+        (4, {}, LIMITED, [(0.0, [1, 2, 3, 4]), (0.1, [5, -1, 2, 4]), (0.2, [5, 6, -1, 1])]),
+        # Targets need no way back.
+        (4, {"neutral": [9, 9]}, ABSOLUTE, [(0.0, [1, 2, 3, 4]), (0.1, [5, 2, 3, 4])]),
         # Without alignment, the new chunk is executed from its first row.
         (4, {"align": False}, RELATIVE, [(0.0, [1, 2, 3, 4]), (0.2, [5, 6, 1, 2, 3, 4])]),
         # The remaining rows are executed while the policy computes. When they end, relative actions
         # stop.
-        (4, {}, RELATIVE, [(0.2, [0, 0, 1, 2, 3, 4]), (0.2, [5, 6, 3, 4]), (0.3, [5, 6, 0, 3, 4])]),
+        (
+            4,
+            {},
+            RELATIVE,
+            [(0.2, [0, 0, 1, 2, 3, 4]), (0.2, [5, 6, -5, 4]), (0.3, [5, 6, 0, -5, 4])],
+        ),
         # Absolute actions hold the last one.
         (4, {"neutral": [9, 9]}, ABSOLUTE, [(0.2, [9, 9, 1, 2, 3, 4]), (0.4, [5, 6, 6, 6, 3, 4])]),
         # If holding continues a motion, the last action is repeated instead of the remaining rows.
@@ -58,7 +68,7 @@ def clock(**settings: Any) -> ClockConfig:
             None,
             {"meanwhile": "hold"},
             RELATIVE,
-            [(0.2, [0, 0, 1, 2, 3, 4, 5, 6]), (0.2, [6, 6, 3, 4, 5, 6]), (0.9, [6] * 9 + [6])],
+            [(0.2, [0, 0, 1, 2, 3, 4, 5, 6]), (0.2, [6, 6, -6, 4, 5, 6]), (0.9, [6] * 9 + [-6])],
         ),
     ],
 )
@@ -117,7 +127,7 @@ def test_an_answer_ends_the_episode_only_with_its_last_row(
     answers: list[tuple[int, int, int, bool]],
 ) -> None:
     """An answer that is too late for real-time chunking is dropped, as a chunk player drops it."""
-    player = ChunkExecutor(2, clock(), RELATIVE)
+    player = ChunkExecutor(2, clock(neutral=[0, 0]), ABSOLUTE)
     plan = ChunkBuffer()
     for count, late, continued, done in answers:
         rows = CHUNK[:count] + 0.5
@@ -142,7 +152,8 @@ def test_a_single_action_is_executed_however_late_it_comes() -> None:
 def test_an_answer_later_than_all_its_rows_is_good_for_its_last_one() -> None:
     player = ChunkExecutor(2, clock(), RELATIVE)
     played(player, 0.0)
-    assert played(player, 0.3, CHUNK[:3]) == [3, 4, 5, 3]
+    # The row stands for the pose 1 + 2 + 3, which is 6 behind the robot.
+    assert played(player, 0.3, CHUNK[:3]) == [3, 4, 5, -6]
 
 
 def test_a_started_tick_is_over_and_rounding_starts_none() -> None:
@@ -246,7 +257,7 @@ def test_a_policy_that_chunks_in_real_time_is_told_what_is_left_and_for_how_long
 
 
 def test_an_answer_later_than_the_rows_it_was_given_is_dropped() -> None:
-    player = ChunkExecutor(2, clock(real_time_chunking=True, neutral=[0, 0]), RELATIVE)
+    player = ChunkExecutor(2, clock(real_time_chunking=True, neutral=[0, 0]), ABSOLUTE)
     assert played(player, 0.0) == [1, 2]
     late = [float(tick.action[0]) for tick in player.ticks(10 + CHUNK, 0.3, {GIVEN: 2})]
     assert late == [3, 4, 5]

@@ -19,7 +19,7 @@ import numpy as np
 from vlagents_ray.chunking.buffer import ChunkBuffer, DelayEstimate
 from vlagents_ray.columns import Columns
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.evaluate.plan.config import ClockConfig
 
 _SYNCHRONOUS = ClockConfig(latency=0)
@@ -85,7 +85,7 @@ class ChunkExecutor:
         if self._clock.neutral is not None:
             _require_fit(self._clock.neutral, env.action)
 
-        self._plan = ChunkBuffer()
+        self._plan = ChunkBuffer(action=env.action)
         self._tick = 0  # the number of the next tick in real-time mode
         self._last = last  # the last action, (D,)
         self._answered = False  # whether a row of an answer was executed
@@ -138,7 +138,7 @@ class ChunkExecutor:
         # First, the ticks between the observation and the answer.
         ticks_waited = math.ceil(latency_s * self._hz - _EXACTLY)
         self._delay.add(ticks_waited)
-        observed = self._tick
+        observed, origin = self._tick, self._plan.origin()
         executed_at_request = self._plan.executed
         yield from self._waiting(ticks_waited, rows.shape[1])
         if self._plan.outruns(executed_at_request, info or {}):
@@ -147,15 +147,18 @@ class ChunkExecutor:
         # The last row is always executed; otherwise no action of a policy that is slower than its
         # chunks would ever be executed.
         latest_start = self._plan.executed - len(rows) + 1
-        start = max(executed_at_request, latest_start)
-        self._plan.replace(rows, start if self._clock.align else None, observed)
-        first = self._plan.take()
+        if self._clock.align:
+            start = max(executed_at_request, latest_start)
+        else:
+            start, origin = self._plan.executed, self._plan.origin()
+        self._plan.replace(rows, start, observed, origin)
         self._answered = True
-        remaining = [first.action, *rows[first.row + 1 : execute]]
-        for action in remaining[:-1]:
-            yield self._executed(action, observed)
-            self._plan.advance()
-        yield self._executed(remaining[-1], observed)._replace(done=done)
+        end = len(rows) if execute is None else min(execute, len(rows))
+        is_last = False
+        while not is_last:
+            step = self._plan.take()
+            is_last = step.row >= end - 1
+            yield self._executed(step.action, observed)._replace(done=done and is_last)
 
     def _waiting(self, ticks: int, dim: int) -> Iterator[Tick]:
         for _ in range(ticks):
@@ -165,10 +168,12 @@ class ChunkExecutor:
                 # A repeated relative action moves the robot further, so that the plan advances.
                 repeats = self._clock.meanwhile == "hold" and self._answered
                 if repeats and Columns.from_spec(self._spec, dim).relative:
-                    self._plan.advance()
+                    self._plan.advance(action)
+                else:
+                    self._plan.move(action)
                 yield self._executed(action, None, waited=True)
             else:
-                self._plan.advance()
+                self._plan.advance(step.action)
                 yield self._executed(step.action, step.chunk.tick, waited=True)
 
     def _executed(self, action: np.ndarray, observed: int | None, *, waited: bool = False) -> Tick:
@@ -238,5 +243,10 @@ def _require_fit(action: Sequence[float], spec: ActionSpec) -> None:
         expected = f"numbers of at least {spec.low:g}"
     elif spec.high is not None and max(action, default=0.0) > spec.high:
         expected = f"numbers of at most {spec.high:g}"
+    elif spec.dim is not None:
+        try:
+            Columns.from_spec(spec, spec.dim).require_rotations(action)
+        except InvalidAction:
+            expected = f"a rotation ({spec.rotation}) in its columns"
     if expected is not None:
         raise ConfigError(f"clock.neutral: expected {expected}, got {list(action)}; correct it")
