@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from batch_bits import differing_acts, invariant
 from counting_compiler import counting_compiler
 from normal_steps import logprob_of_steps
 from pushed_weights import check_pushed_weights
@@ -361,3 +362,26 @@ def test_the_policy_with_an_adapter_acts_with_merged_weights(
     np.testing.assert_allclose(actions, acted(merged, views), atol=BATCHED)
     assert not np.allclose(actions, acted(loaded, views), atol=BATCHED)
     check_pushed_weights(adapted, lambda: begun(adapted, 0).act(seen(0)).action)
+
+
+@pytest.mark.parametrize("rows", [1, 4, 16])
+def test_no_bit_of_an_action_depends_on_its_batch(folder: Path, rows: int) -> None:
+    with invariant(rows) as report:
+        policy = made(folder, noise_level=LEVEL)
+    assert report.variation is None
+
+    def observe(robot: int, tick: int) -> Obs:
+        kinds: list[dict[str, Any]] = [
+            {},
+            {SAMPLES: 1 + robot % 3},
+            {LEFTOVER: np.zeros((3, 4), np.float32), DELAY: 1 + robot % 2},
+            {WANT: ALL},
+        ]
+        return seen(100 * tick + robot, (64 + robot, 64), **kinds[(robot + tick) % 4])
+
+    def begin(robot: int) -> Any:
+        return begun(policy, robot, WORDS[robot % 2])
+
+    compared, differing = differing_acts(policy, begin, observe, ticks=4)
+    assert compared == 4 * 4 * 11
+    assert differing == []

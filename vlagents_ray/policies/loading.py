@@ -10,11 +10,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from vlagents_ray.policies.row_limit import RowLimit
 
 logger = logging.getLogger(__name__)
+
+# Whether the bits of an action must not depend on its batch; "auto": if the policy supports it.
+Invariant = bool | Literal["auto"]
 
 COMPILED_SIZES = (1, 2, 4, 8, 16)  # used if no server sets its batch sizes
 
@@ -25,6 +28,11 @@ class LoadingReport:
 
     on_progress: Callable[[str], None]  # called with each step, on the loading thread
     batch_sizes: Sequence[int]  # the batch sizes of the server, ascending
+    # Whether the server requires that the bits of an action do not depend on its batch. Then
+    # `batch_sizes` is the one size of all forward passes.
+    invariant: bool = False
+    # With `invariant`, why the bits of an action may depend on its batch; None if they do not.
+    variation: str | None = None
     # Parts that run without compilation, although `compile` is set.
     uncompiled: list[str] = field(default_factory=list)
     # Descriptions of the models' devices, see `accelerator.torch_device`.
@@ -59,6 +67,8 @@ def loading_report(
     batch_sizes: Sequence[int] = COMPILED_SIZES,
     on_out_of_memory: Callable[[], None] = lambda: None,
     on_gpu_ms: Callable[[float], None] = lambda _: None,
+    *,
+    invariant: bool = False,
 ) -> Iterator[LoadingReport]:
     """Yield the report of the policy that is loaded in this context.
 
@@ -67,6 +77,7 @@ def loading_report(
     report = LoadingReport(
         on_progress,
         batch_sizes,
+        invariant,
         on_out_of_memory=on_out_of_memory,
         on_gpu_ms=on_gpu_ms,
     )
@@ -102,6 +113,16 @@ def report_device(device: dict[str, Any]) -> None:
     report = _report.get()
     if report is not None and device not in report.devices:
         report.devices.append(device)
+
+
+def report_variation(variation: str | None) -> None:
+    """Report why the bits of an action may depend on its batch; None if they do not.
+
+    Without `invariant`, this does nothing.
+    """
+    report = _report.get()
+    if report is not None and report.invariant:
+        report.pads, report.variation = True, variation
 
 
 def report_uncompiled(part: str) -> None:

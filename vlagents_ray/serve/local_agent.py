@@ -46,6 +46,7 @@ def build_engine(
         max_batch_size=args.batch.max_size,
         patience=args.batch.patience,
         batch_sizes=args.batch.sizes or (),
+        invariant=args.batch.invariant,
         session_limit=args.sessions.limit,
         session_idle_s=args.sessions.idle_s,
         version=version_of(args),
@@ -84,6 +85,7 @@ def policy_metadata(
         "version": importlib.metadata.version("vlagents-ray"),
         "code": None if code is None else code.to_json(),
         "program": program | model.files,
+        "passes": model.passes,
         "batch_costs": engine.queue.window.describe_costs(),
     }
 

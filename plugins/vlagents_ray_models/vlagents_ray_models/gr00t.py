@@ -709,6 +709,7 @@ class Gr00t(ModelPolicy):
     config: Gr00tConfig
     model: Gr00tNetwork | None
     trainable = "model.model"
+    variation = "prompts are padded to the longest one, or computed in separate passes"
 
     @property
     def history(self) -> int:

@@ -861,6 +861,10 @@ class Onnx(ModelPolicy):
     def contract(self) -> Contract:
         return Contract() if self.model is None else self.model.contract
 
+    @property
+    def batched(self) -> bool:
+        return bool(self.loaded().batched)
+
     def load(self) -> Network:
         """Read the file; raises `ConfigError` if it cannot be read or does not fit the
         settings.
@@ -884,7 +888,8 @@ class Onnx(ModelPolicy):
             episode = self._current_episode()
             frames = tuple(episode.frames)
             row = Row(frames, episode.instruction, episode.rng, memory=episode.memory)
-            self.predict([row])
+            # As for an action, so that the memory has the bits of a pass of the usual size.
+            self._forward([row])
 
     def perceive(self, obs: Obs) -> Frame:
         """Return the inputs that come from an observation and from the instruction."""

@@ -581,6 +581,7 @@ class VJepa2Ac(ModelPolicy):
 
     Config: ClassVar[type] = VJepa2AcConfig
     config: VJepa2AcConfig
+    variation = "the goal images of new goals are encoded together"
 
     def __init__(self, config: VJepa2AcConfig) -> None:
         super().__init__(config)

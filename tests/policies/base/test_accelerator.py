@@ -74,7 +74,10 @@ def test_without_a_gpu_auto_is_the_cpu(monkeypatch: Any, given: str | None) -> N
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", given)
     with loading_report(lambda _: None) as report:
         assert torch_device("auto").type == "cpu"
-    assert report.devices == [{"kind": "cpu", "device": "cpu", "torch": torch.__version__}]
+    threads = torch.get_num_threads()
+    assert report.devices == [
+        {"kind": "cpu", "device": "cpu", "torch": torch.__version__, "threads": threads}
+    ]
     assert type(report.devices[0]["torch"]) is str  # readable without torch
 
 

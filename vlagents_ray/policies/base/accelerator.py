@@ -80,6 +80,9 @@ def torch_device(name: str = "auto") -> Any:
     # unpickle.
     version = str(torch.__version__)
     described = {"kind": device.type, "device": str(device), "torch": version}
+    if device.type == "cpu":
+        # The number of threads decides how products are divided, and with it their rounding.
+        described["threads"] = torch.get_num_threads()
     if device.type == "cuda":
         if share:
             torch.cuda.set_per_process_memory_fraction(share, device)

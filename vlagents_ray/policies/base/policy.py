@@ -12,13 +12,14 @@ import logging
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from operator import attrgetter
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
+from vlagents_ray.abilities import ContinuesPlans, ability
 from vlagents_ray.chunking.buffer import ENSEMBLE, Chunk, ChunkBuffer
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.errors import (
@@ -67,6 +68,7 @@ from vlagents_ray.policies.loading import (
     LoadingReport,
     current_report,
     report_progress,
+    report_variation,
 )
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.validation import check_action
@@ -152,6 +154,22 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         into memory.
         """
         return min(self.config.rows, self.report.row_limit.rows or self.config.rows)
+
+    @property
+    def batched(self) -> bool:
+        """Whether `predict` computes the rows of a pass together, once the model is loaded."""
+        return True
+
+    @property
+    def variation(self) -> str | None:
+        """Why the bits of a row's result may depend on the other rows of a pass of a fixed size;
+        None if they do not.
+
+        A family overrides this if the shapes of a pass depend on its rows, as with prompts that are
+        padded to the longest one. Everything else is measured with `batch: {invariant: true}` when
+        the model is loaded.
+        """
+        return None
 
     @property
     def state_dim(self) -> int | None:
@@ -253,6 +271,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         elif self.report.accelerated:
             self.merge_products()
         self._warm_up()
+        if self.report.invariant:
+            report_variation(self.variation or self._measure_variation())
 
     def _warm_up(self) -> None:
         """Run or compile each batch size."""
@@ -302,6 +322,77 @@ class ModelPolicy(TrainableAgent, abc.ABC):
                 self._run_rows(size, seeds)
         self.report.splits_by_time = self.report.accelerated
 
+    def _measure_variation(self) -> str | None:
+        """Compute the same rows at other places of a pass, and beside other rows.
+
+        The kernels of a library may differ between the places of a batch, for instance at the end
+        of a thread's share of the rows.
+
+        Returns:
+            A sentence about the rows whose bits differ; None if all are equal.
+        """
+        sizes = self.config.batch_sizes
+        if sizes == [1]:
+            return None
+        [size] = self.report.batch_sizes
+        if sizes != [size]:
+            return f"its batch_sizes are {sizes}, and batch.max_size is {size}"
+        rows = self._rows_of_each_kind(size)
+        expected = self._bits(rows)
+
+        # Neighbouring places together cover all places.
+        for shift in sorted({1, size // 2} - {0, size}):
+            order = [*range(shift, size), *range(shift)]
+            bits = self._bits([rows[i] for i in order])
+            places = [place for place, i in enumerate(order) if bits[place] != expected[i]]
+            if places:
+                return (
+                    f"in a pass of {size} rows, the bits of a row depend on its place: they differ "
+                    f"at {len(places)} of {size} places"
+                )
+        for i in range(min(size, len(self._kinds_of_rows()))):
+            if self._bits(rows[i : i + 1]) != expected[i : i + 1]:
+                return f"in a pass of {size} rows, the bits of a row depend on the other rows"
+        return None
+
+    def _rows_of_each_kind(self, number: int) -> list[Row]:
+        """Return random rows, of each kind in turn."""
+        kinds = self._kinds_of_rows()
+        rows = []
+        for seed in range(number):
+            kind = kinds[seed % len(kinds)]
+            rows.append(replace(self._example(seed), **kind))
+        return rows
+
+    def _kinds_of_rows(self) -> list[dict[str, Any]]:
+        """Return the fields of each kind of row: an ordinary one, and, if the policy supports it,
+        one that continues a plan and one whose outputs are requested.
+        """
+        contract = self.contract or Contract()
+        kinds: list[dict[str, Any]] = [{}]
+        plans = ability(self, ContinuesPlans)
+        dim = contract.action.dim
+        if plans is not None and plans.continues_plans and dim and contract.chunk:
+            leftover = np.zeros((max(1, contract.chunk - 1), dim), np.float32)
+            kinds.append({"leftover": leftover, "delay": 1})
+        if contract.behaviour:
+            kinds.append({"want": tuple(contract.behaviour), "sample": True})
+        return kinds
+
+    def _bits(self, rows: Sequence[Row]) -> list[list[bytes]]:
+        """Compute rows in forward passes, and return the bytes of the arrays of each result."""
+        copies = [
+            replace(row, rng=copy.deepcopy(row.rng), memory=copy.deepcopy(row.memory))
+            for row in rows
+        ]
+        bits = []
+        for prediction in self._forward(copies):
+            if isinstance(prediction, Exception):
+                raise prediction
+            arrays = (prediction.actions, prediction.mean, prediction.std)
+            bits.append([np.asarray(array).tobytes() for array in arrays if array is not None])
+        return bits
+
     def _decide_on_compiling(self) -> None:
         """Resolve the setting `compile` for the loaded model and its device."""
         device_kinds = [device["kind"] for device in self.report.devices]
@@ -321,8 +412,10 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             )
         self.compilation.mode = mode
         self.config = self.config.model_copy(update={"compile": mode})
-        if mode:
-            self.config = self.config.with_sizes(self.report.batch_sizes)
+        if mode or self.report.invariant:
+            # Rows that are computed one by one need no padding.
+            is_alone = self.report.invariant and not self.batched
+            self.config = self.config.with_sizes([1] if is_alone else self.report.batch_sizes)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode; the option `seed` is an int (default 0)."""
@@ -604,16 +697,26 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         """Return the items of a batch, with the last item repeated up to the next batch size."""
         return items + items[-1:] * (self._size(len(items)) - len(items))
 
+    def with_fillers(self, rows: list[Row]) -> list[Row]:
+        """Return the rows of a pass, padded to the next batch size.
+
+        The rows that pad the pass are copies, so that they draw no noise from the session's
+        generator.
+        """
+        fillers = self.padded(rows)[len(rows) :]
+        copies = [copy.deepcopy(row, {id(row.frames): row.frames}) for row in fillers]
+        padded_rows = [*rows, *copies]
+        if self.report.invariant:
+            # No row shares its observations, so that they are also encoded in one size.
+            padded_rows = [replace(row, frames=(*row.frames,)) for row in padded_rows]
+        return padded_rows
+
     def _passes(self, rows: list[Row]) -> list[Prediction | Exception]:
         """Compute all rows, in the forward passes that `_split` returns."""
         predictions: list[Prediction | Exception] = []
         for size in self._split(len(rows)):
             pass_rows = rows[len(predictions) : len(predictions) + size]
-            # The rows that pad the pass are copies, so that they draw no noise from the session's
-            # generator.
-            fillers = self.padded(pass_rows)[len(pass_rows) :]
-            copies = [copy.deepcopy(row, {id(row.frames): row.frames}) for row in fillers]
-            padded_rows = [*pass_rows, *copies]
+            padded_rows = self.with_fillers(pass_rows)
 
             began = time.perf_counter()
             with self.report.timer():

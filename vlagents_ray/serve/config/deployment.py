@@ -10,6 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from vlagents_ray.bounds import MOST_BYTES, MOST_CPUS, MOST_ROWS, MOST_S, MOST_WORKERS
 from vlagents_ray.policies.base.program import Program, loaded_code, software
+from vlagents_ray.policies.loading import Invariant
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.ray_tools.git_state import GitState, code_of
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
@@ -93,6 +94,12 @@ class BatchArgs(_DeploymentModel):
         "are padded to the next size. The largest is `max_size`, which may then be "
         "omitted.",
     )
+    invariant: Invariant = Field(
+        default=False,
+        description="Pad each forward pass to `max_size` rows, so that each bit of an action is "
+        "the same alone, in any batch, after a restart and on an equal replica. A policy for which "
+        "this does not hold is rejected. `auto`: pad, but accept any policy.",
+    )
     patience: float = Field(
         default=0.1,
         ge=0,
@@ -105,6 +112,11 @@ class BatchArgs(_DeploymentModel):
     def _consistent(self) -> BatchArgs:
         if self.sizes is None:
             return self
+        if self.invariant:
+            raise ValueError(
+                f"sizes: expected none with `invariant`, whose only size is max_size, got "
+                f"{self.sizes}; leave them out"
+            )
         if not self.sizes or self.sizes[0] < 1 or self.sizes != sorted(set(self.sizes)):
             raise ValueError(
                 "sizes: expected ascending positive numbers, such as [1, 2, 4, 8, 16], got "

@@ -84,11 +84,12 @@ class Engine:
         loader = Loader(
             source.make,
             settings.version,
-            settings.batch_sizes,
+            settings.padded_sizes,
             settings.max_batch_size,
             settings.check,
             self.calls,
             self.stats,
+            invariant=settings.invariant,
         )
         self.model = ServedModel(source.config, loader, self.sessions, on_step)
         self._swapping = threading.Lock()  # held during a swap

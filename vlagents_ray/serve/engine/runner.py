@@ -81,7 +81,7 @@ class Runner:
         self._stats = parts.stats
         self._finder = parts.finder
         self._clock = parts.clock
-        self._batch_sizes = parts.settings.batch_sizes
+        self._batch_sizes = parts.settings.padded_sizes
         self._reply_bytes = parts.settings.reply_bytes
         self._load_s = parts.settings.limits.load_s
 

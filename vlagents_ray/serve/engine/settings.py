@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from vlagents_ray.contract import Contract
+from vlagents_ray.policies.loading import Invariant
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, REPLY_BYTES
 from vlagents_ray.serve.queue.call_limits import CallLimits
 
@@ -23,6 +24,9 @@ class EngineSettings:
     # Sizes to which batches are padded; the largest one is `max_batch_size`. If there are none, a
     # compiled policy that specifies no sizes is compiled for 1, 2, 4, … `max_batch_size`.
     batch_sizes: Sequence[int] = ()
+    # Whether each forward pass has `max_batch_size` rows, so that the bits of an action do not
+    # depend on its batch.
+    invariant: Invariant = False
     session_limit: int = 1000  # maximum number of sessions
     session_idle_s: float = 600.0  # time without a request after which a session may be dropped, s
     # Version of the policy; sessions only move between replicas of equal version and settings.
@@ -37,3 +41,8 @@ class EngineSettings:
     # Whether a thread of the engine runs the policy. Otherwise the thread that calls `start` runs
     # the policy, and then calls `queue.take` and `runner.run` alternately.
     threaded: bool = True
+
+    @property
+    def padded_sizes(self) -> Sequence[int]:
+        """The numbers of rows to which forward passes are padded; empty if they are not."""
+        return (self.max_batch_size,) if self.invariant else self.batch_sizes

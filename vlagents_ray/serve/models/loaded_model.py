@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from vlagents_ray.abilities import BeginsWithPlan, ContinuesPlans, HasStatistics, ability
 from vlagents_ray.contract import Contract, require_match
-from vlagents_ray.errors import UnknownSession
+from vlagents_ray.errors import ConfigError, UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.act_stream import ActStream, GpuCalls
 from vlagents_ray.policies.agent_copies import AgentCopies
@@ -28,10 +28,11 @@ from vlagents_ray.policies.base.checkpoint import (
 )
 from vlagents_ray.policies.base.checkpoint_files import identify_weights, success_of
 from vlagents_ray.policies.base.program import Program, digest_of, files_named, with_defaults
-from vlagents_ray.policies.loading import LoadingReport, loading_report
+from vlagents_ray.policies.loading import Invariant, LoadingReport, loading_report
 from vlagents_ray.policies.wrapper import unwrapped
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.in_time import tolerated_age_ms
+from vlagents_ray.serve.models.invariance import batch_variation
 from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
 from vlagents_ray.serve.weights import HoldsWeights, ModelWeights
 from vlagents_ray.success import SuccessCurve
@@ -144,6 +145,8 @@ class LoadedModel:
     # Maximum number of rows of the executed plan that a chunk repeats exactly at its beginning; 0
     # for none.
     longest_prefix: int
+    # Why the bits of an action may depend on its batch; None if they do not.
+    variation: str | None
     closed: bool = False
     # The stream of the agent's calls, on any thread; None without a GPU of torch.
     acts: ActStream | None = field(init=False)
@@ -290,18 +293,21 @@ class Loader:
         self,
         make: Callable[[Mapping[str, Any]], Agent],
         version: str,
-        batch_sizes: Sequence[int],
+        padded_sizes: Sequence[int],
         max_batch_size: int,
         check: Callable[[Contract | None], None],
         calls: PolicyCalls,
         stats: ModelStats,
+        *,
+        invariant: Invariant = False,
     ) -> None:
         """Create the loader; `make` is described at `PolicySource`, and `stats` records the reports
         of the models. `EngineSettings` describes the other arguments.
         """
-        self._make, self._version, self._batch_sizes = make, version, batch_sizes
-        self._compiled_sizes = batch_sizes or powers_up_to(max_batch_size)
+        self._make, self._version, self._padded_sizes = make, version, padded_sizes
+        self._compiled_sizes = padded_sizes or powers_up_to(max_batch_size)
         self._check, self._calls, self._stats = check, calls, stats
+        self._invariant = invariant
 
     def load(self, settings: Mapping[str, Any], on_progress: Callable[[str], None]) -> LoadedModel:
         """Load a model into a new agent, which is closed if it cannot be served.
@@ -328,6 +334,7 @@ class Loader:
                     self._compiled_sizes,
                     self._stats.out_of_memory,
                     self._stats.gpu,
+                    invariant=bool(self._invariant),
                 ) as report,
             ):
                 agent.initialize()
@@ -356,6 +363,7 @@ class Loader:
             if weights is not None and curves:
                 weights = {**weights, "success": curves}
 
+            variation = self._variation(agent, report)
             contract = agent.contract
             self._check(contract)
             copies = AgentCopies(agent)
@@ -368,7 +376,9 @@ class Loader:
             _close_agent(agent)
             raise
 
-        padding = Padding(() if report.pads else self._batch_sizes, copies.make)
+        # With `invariant`, a policy that does not pad its batches computes each row alone.
+        pads = report.pads or bool(self._invariant)
+        padding = Padding(() if pads else self._padded_sizes, copies.make)
         digest = (weights or {}).get("digest") or ""
         version = (self.version(settings), f"{copies.fingerprint} {digest}")
         if weights is not None and digest:
@@ -395,7 +405,25 @@ class Loader:
             report,
             continues_plans,
             longest_prefix,
+            variation,
         )
+
+    def _variation(self, agent: Agent, report: LoadingReport) -> str | None:
+        """Return why the bits of an action may depend on its batch; None if they do not.
+
+        Raises:
+            ConfigError: They may, and the deployment requires that they do not.
+        """
+        if not self._invariant:
+            return "batch.invariant is off"
+        variation = batch_variation(agent, report, self._compiled_sizes[-1])
+        if variation is not None and self._invariant is True:
+            raise ConfigError(
+                "batch.invariant: expected a policy whose actions do not depend on their batch, "
+                f"got one that may: {variation}; set batch.max_size to 1, or leave `invariant` out"
+            )
+        logger.info("actions depend on their batch: %s", variation or "no, not on any bit")
+        return variation
 
     def version(self, settings: Mapping[str, Any]) -> str:
         """Return the version of the policy that has these settings."""

@@ -174,6 +174,22 @@ class ServedModel:
         return [] if model is None else model.report.devices
 
     @property
+    def passes(self) -> dict[str, Any]:
+        """The forward passes on which the bits of actions depend: whether they are `invariant`, and
+        if so the number of their `rows`.
+        """
+        model = self._loaded
+        if model is None or model.variation is not None:
+            return {"invariant": False}
+        return {"invariant": True, "rows": model.report.batch_sizes[-1]}
+
+    @property
+    def variation(self) -> str | None:
+        """Why the bits of an action may depend on its batch; None if they do not."""
+        model = self._loaded
+        return "no model is loaded" if model is None else model.variation
+
+    @property
     def uncompiled(self) -> list[str]:
         """The parts of the model that run without compilation, although its settings request it."""
         model = self._loaded

@@ -42,6 +42,7 @@ def make_agent(args: ServerArgs, config: Mapping[str, Any]) -> Agent:
             batch=args.batch.max_size,
             version=version_of(args),
             wrappers=args.wrappers,
+            invariant=bool(args.batch.invariant),
         )
         return ChildAgent(ChildProgram(environment.python, settings, environment.env_vars))
     return build_agent(args.policy, config, args.wrappers)

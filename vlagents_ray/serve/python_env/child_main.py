@@ -55,6 +55,8 @@ class Settings:
     batch: int  # maximum number of observations in one forward pass
     version: str  # version of the deployment: sessions move only between equal versions
     wrappers: Sequence[Any] = ()  # wrappers of the policy, as in a deployment file
+    # Whether passes have `batch` rows, so that the bits of an action do not depend on its batch.
+    invariant: bool = False
 
 
 def examine(policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()) -> dict[str, Any]:
@@ -101,6 +103,8 @@ def run() -> None:
         agent = build_agent(settings.policy, settings.config, settings.wrappers)
         engine_settings = EngineSettings(
             max_batch_size=settings.batch,
+            # The replica rejects a policy for which this does not hold.
+            invariant="auto" if settings.invariant else False,
             session_limit=sys.maxsize,
             session_idle_s=_NEVER_S,
             version=settings.version,
@@ -129,6 +133,7 @@ def run() -> None:
             "weights": model.weights,
             "uncompiled": model.uncompiled,
             "devices": model.devices,
+            "variation": model.variation,
             "trained": _describe_trained(agent, engine.weights),
         }
     )

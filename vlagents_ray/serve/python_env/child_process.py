@@ -16,7 +16,12 @@ from typing import Any
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable
-from vlagents_ray.policies.loading import report_device, report_progress, report_uncompiled
+from vlagents_ray.policies.loading import (
+    report_device,
+    report_progress,
+    report_uncompiled,
+    report_variation,
+)
 from vlagents_ray.protocol.messages import LocalAddress
 from vlagents_ray.serve.python_env import child_main
 from vlagents_ray.serve.python_env.child_main import Settings
@@ -113,6 +118,7 @@ class ChildProcess:
             report_uncompiled(module)
         for device in document["devices"]:
             report_device(device)
+        report_variation(document["variation"])
         return LoadedPolicy.from_json(document)
 
     def require_alive(self) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from batch_bits import ROBOTS, differing_acts, invariant
 from in_flight import asked
 from in_process_replicas import Replicas
 from onnx import numpy_helper
@@ -165,6 +166,28 @@ def test_a_padded_or_sampled_row_leaves_the_memory_as_it_is(recurrent: Path) -> 
     with_samples = [Obs(state=obs.state, info={"samples": 3}) for obs in observations]
     for plain, sampled in zip(acts(policy, observations), acts(policy, with_samples), strict=True):
         np.testing.assert_allclose(plain.action, sampled.action, atol=1e-6)
+
+
+@pytest.mark.parametrize("rows", [1, 3, 16])
+def test_no_bit_of_an_action_depends_on_its_batch(recurrent: Path, rows: int) -> None:
+    with invariant(rows) as report:
+        policy = loaded(recurrent, **MEMORY)
+    assert report.variation is None
+
+    def begin(robot: int) -> Onnx:
+        session = AgentCopies(policy).make()
+        session.reset(observe(robot, 0), None, seed=robot)
+        # A session that continues on another replica observes without acting.
+        session.observe(observe(robot, -1))
+        return session
+
+    def observe(robot: int, tick: int) -> Obs:
+        [obs] = random_joints(1, seed=1000 * tick + robot + 1000)
+        return Obs(state=obs.state, info={"samples": 2} if (robot + tick) % 3 == 0 else {})
+
+    compared, differing = differing_acts(policy, begin, observe, ticks=5)
+    assert compared == 4 * 5 * ROBOTS
+    assert differing == []
 
 
 def test_a_suite_of_the_interface_accepts_it(recurrent: Path) -> None:

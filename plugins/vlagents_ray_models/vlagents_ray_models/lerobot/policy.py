@@ -93,6 +93,15 @@ class LeRobot(ModelPolicy):
         return 1 if self.model is None else self.model.sampler.steps
 
     @property
+    def batched(self) -> bool:
+        return bool(self.loaded().sampler.batched)
+
+    @property
+    def variation(self) -> str | None:
+        reason: str | None = self.loaded().sampler.variation
+        return reason
+
+    @property
     def state_dim(self) -> int | None:
         feature = None if self.model is None else self.model.sampler.config.robot_state_feature
         return None if feature is None else int(feature.shape[0])
@@ -223,8 +232,8 @@ class LeRobot(ModelPolicy):
 
         predictions: dict[int, Prediction | Exception] = {}
         for indices in by_shapes.values():
-            drawn = self._draw([rows[i] for i in indices])
-            predictions.update(zip(indices, drawn, strict=True))
+            drawn = self._draw(self.with_fillers([rows[i] for i in indices]))
+            predictions.update(zip(indices, drawn, strict=False))
         return [predictions[i] for i in range(len(rows))]
 
     def _draw(self, rows: list[Row]) -> list[Prediction]:

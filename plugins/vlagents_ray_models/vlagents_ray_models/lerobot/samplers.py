@@ -49,6 +49,7 @@ class Sampler:
     """
 
     batched = False  # whether `draw` accepts several rows
+    variation: str | None = None  # see `ModelPolicy.variation`
     # Fields of the config that may contain the number of rows of a chunk, in order of preference.
     lengths: ClassVar[tuple[str, ...]] = ("chunk_size", "n_action_steps")
     random_steps: RandomSteps | None = None  # random steps of the last call of `draw`
@@ -474,6 +475,7 @@ class GrootSampler(Sampler):
     """
 
     batched = True
+    variation = "prompts of different lengths are computed in separate passes"
 
     @property
     def horizon(self) -> int:

@@ -613,6 +613,7 @@ class PrismaticPolicy(ModelPolicy):
 
     config: Any
     network = "model.base.network"
+    variation = "prompts are padded to the longest one"
 
     @abc.abstractmethod
     def _model_input(self, row: Row, key: str) -> Any:
