@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from tests.golden.traces import Step, Trace
+from vlagents_ray.protocol.compact import CompactWriter
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, PlasmaAddress, Request
-from vlagents_ray.protocol.shm_layout import ShmWriter
 
 STREAMS = ("own port", "/v1/stream")
 FRAMES = (*STREAMS, "handle")
@@ -85,7 +85,7 @@ def http(
 
 def _encoder(endpoint: str, who: str) -> Callable[[ScenarioMessage], tuple[bytes, ...]]:
     """Return the function that encodes messages like the transports of `vlagents_ray.client`."""
-    writer, sent = ShmWriter(), iter(range(1000))
+    writer, sent = CompactWriter(), iter(range(1000))
 
     def encode(message: ScenarioMessage) -> tuple[bytes, ...]:
         if isinstance(message, tuple):

@@ -23,7 +23,7 @@ from eval_fakes import wait_for
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol import frame_layout, shm_layout
+from vlagents_ray.protocol import compact, frame_layout
 from vlagents_ray.protocol.frames import encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, MessageLimits, Request
 from vlagents_ray.protocol.websocket_frames import frame_head
@@ -195,12 +195,12 @@ def over_shared_memory(_replica: Replica, client: ShmTransport) -> Iterator[None
 
 
 def _compact(acts: int) -> bytes:
-    written = shm_layout.ShmWriter().write([Request("act", SMALL, session="b", request_id="x")])
+    written = compact.CompactWriter().write([Request("act", SMALL, session="b", request_id="x")])
     assert written is not None
-    item = written.message[shm_layout.COUNT.size :]
-    known = shm_layout.ITEM.pack(0, 0, -1, float("nan"), float("nan"), b"y")
-    text = item[shm_layout.ITEM.size :]
-    return shm_layout.COUNT.pack(acts) + item[: shm_layout.ITEM.size] + known * (acts - 1) + text
+    item = written.message[compact.COUNT.size :]
+    known = compact.ITEM.pack(0, 0, -1, float("nan"), float("nan"), b"y")
+    text = item[compact.ITEM.size :]
+    return compact.COUNT.pack(acts) + item[: compact.ITEM.size] + known * (acts - 1) + text
 
 
 @contextlib.contextmanager

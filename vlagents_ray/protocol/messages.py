@@ -205,7 +205,7 @@ class LocalAddress:
 
     # The data of a request are in a memory file of the client. The file's descriptor is sent with
     # the first message that refers to the file. The data are a frame or, with COMPACT, the arrays
-    # of the acts that follow the message's header (see `vlagents_ray.protocol.shm_layout`). A reply
+    # of the acts that follow the message's header (see `vlagents_ray.protocol.compact`). A reply
     # follows its header, or is in a memory file whose descriptor is sent with the header.
     # REQUEST packs the number of the memory file, flags, and the number of bytes in it.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")

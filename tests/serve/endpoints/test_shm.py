@@ -38,7 +38,7 @@ from vlagents_ray.errors import (
     UnknownSession,
 )
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol import shm_layout
+from vlagents_ray.protocol import compact
 from vlagents_ray.protocol.frames import encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, Request, peer_uid
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
@@ -324,7 +324,7 @@ def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, ShmServer]) -
     def pack(number: int, length: int, flags: int = 0) -> bytes:
         return LocalAddress.REQUEST.pack(number, flags, length)
 
-    act = shm_layout.ShmWriter().write([request("act")])
+    act = compact.CompactWriter().write([request("act")])
     assert act is not None
     frame = encode_requests([request("act")])
 

@@ -33,7 +33,7 @@ from vlagents_ray.client.transports.base import (
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.polling import Polling
-from vlagents_ray.protocol import shm_layout
+from vlagents_ray.protocol import compact
 from vlagents_ray.protocol.frames import decode_replies, request_parts
 from vlagents_ray.protocol.messages import LocalAddress, Reply, Request, boot_id, peer_uid
 
@@ -60,7 +60,7 @@ class UnixTransport(ABC):
         self._socket: socket.socket | None = None
         self._poller = select.poll()  # polls the Unix socket
         self._buffer = bytearray(_MESSAGE_BYTES)
-        self._writer = shm_layout.ShmWriter()
+        self._writer = compact.CompactWriter()
         self._polling = Polling(_POLLING_S)
         self._answers_fast = True  # whether the last answer was immediate
 
@@ -112,7 +112,7 @@ class UnixTransport(ABC):
         if self._socket is not None:
             self._socket.close()
             self._socket = None
-        self._writer = shm_layout.ShmWriter()
+        self._writer = compact.CompactWriter()
 
     def _send(
         self, connection: socket.socket, requests: Sequence[Request], deadline: float
@@ -136,7 +136,9 @@ class UnixTransport(ABC):
                 self._unsent()
                 raise
         except BaseException:
-            self._writer = shm_layout.ShmWriter()  # the server may not have received the new layout
+            self._writer = (
+                compact.CompactWriter()
+            )  # the server may not have received the new layout
             raise
 
     def _await(
@@ -150,7 +152,7 @@ class UnixTransport(ABC):
             replies = self._receive(connection)
             if replies and replies[0].answers(requests[0]):
                 if not replies[0].request_id:  # the message was rejected before it was parsed
-                    self._writer = shm_layout.ShmWriter()
+                    self._writer = compact.CompactWriter()
                 self._answers_fast = time.perf_counter() - begun < _FAST_S
                 return replies
 
@@ -207,7 +209,7 @@ class UnixTransport(ABC):
             content = memoryview(self._buffer)[LocalAddress.REPLY.size : size]
         self._answered(freed)
         if flags & LocalAddress.COMPACT:
-            return shm_layout.read_answers(content)
+            return compact.read_answers(content)
         return decode_replies(bytes(content))
 
 

@@ -54,6 +54,8 @@ from vlagents_ray.errors import (
     PolicyUnavailable,
     UnknownApp,
 )
+from vlagents_ray.images.codecs import RAW
+from vlagents_ray.protocol.compact import STREAM_TAG, CompactWriter, is_compact, read_answers
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import decode_replies, request_parts
 from vlagents_ray.protocol.messages import (
@@ -395,6 +397,8 @@ class WebSocketTransport:
         self._codec = codec
         self._socket: ProxiedSocket | Stream | None = None
         self._address: StreamAddress | None = None  # the address of the replica that answered
+        self._sends_compact = False  # whether the server accepts acts in compact form
+        self._writer = CompactWriter()
         # The earliest time at which a replica's own port is tried, time.monotonic().
         self._try_own_port_at = float("-inf")
 
@@ -413,27 +417,35 @@ class WebSocketTransport:
         """Connect like `connect`, but to the replica with this metadata."""
         stream = read_address(StreamAddress, metadata.get("stream"))
         self._address = stream if self._base.scheme == "http" else None
+        self._sends_compact = metadata.get("compact") is True
         self._stream(timeout_s)
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send one frame and return its replies. Replies to earlier requests that timed out are
+        """Send one message and return its replies. Replies to earlier requests that timed out are
         discarded.
         """
         deadline = time.monotonic() + timeout_s
-        pieces = request_parts(requests, self._codec.codec_for(requests[0].obs, STREAM_BYTES))
+        connection = self._stream(left_s(deadline))
+        pieces = self._pieces(requests)
         size = sum(map(len, pieces))
         if size > STREAM_BYTES:  # the server would close the connection
+            self._writer = CompactWriter()  # the server does not receive the new layouts
             raise MessageTooLarge(
                 f"{self._url}: expected at most {STREAM_BYTES} bytes in a WebSocket message, got "
                 f"{size}; send JPEG, or use transport='http'"
             )
 
-        connection = self._stream(left_s(deadline))
         try:
             connection.send_pieces(pieces, left_s(deadline))
             while True:
-                replies = decode_replies(connection.recv(max(0.0, deadline - time.monotonic())))
+                answer = connection.recv(max(0.0, deadline - time.monotonic()))
+                if is_compact(answer):
+                    replies = read_answers(memoryview(answer)[len(STREAM_TAG) :])
+                else:
+                    replies = decode_replies(answer)
                 if replies[0].answers(requests[0]):
+                    if not replies[0].request_id:  # the message was rejected before it was parsed
+                        self._writer = CompactWriter()
                     return replies
         except ReplicaSilent:
             self.close()
@@ -450,8 +462,15 @@ class WebSocketTransport:
             self._socket.close()
             self._socket = None
 
+    def _pieces(self, requests: Sequence[Request]) -> list[Buffer]:
+        """Return the pieces of a message, in compact form if possible."""
+        codec = self._codec.codec_for(requests[0].obs, STREAM_BYTES)
+        written = self._writer.write(requests) if self._sends_compact and codec == RAW else None
+        return request_parts(requests, codec) if written is None else written.stream_parts()
+
     def _stream(self, timeout_s: float) -> ProxiedSocket | Stream:
         if self._socket is None:
+            self._writer = CompactWriter()  # the new connection knows no layout
             self._socket = self._direct(timeout_s) or self._proxied(timeout_s)
         return self._socket
 

@@ -10,9 +10,9 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from vlagents_ray.protocol.compact import write_answers
 from vlagents_ray.protocol.frames import encode_replies
 from vlagents_ray.protocol.json_messages import reply_to_json
-from vlagents_ray.protocol.shm_layout import write_answers
 from vlagents_ray.serve.requests import IncomingMessage
 
 T = TypeVar("T")

@@ -7,6 +7,7 @@ from functools import partial
 
 from vlagents_ray.errors import MalformedMessage, VLAgentsError
 from vlagents_ray.protocol import messages
+from vlagents_ray.protocol.compact import STREAM_TAG, CompactReader, is_compact
 from vlagents_ray.protocol.frames import Decoded, decode_requests
 from vlagents_ray.serve.access.api_keys import Identity
 from vlagents_ray.serve.access.charges import Charge
@@ -37,6 +38,8 @@ class RequestStream(MessageHandler):
         self._connection = connection
         self._engine = engine
         self._limits = limits
+        self._reader = CompactReader(limits)
+        self._answers_compact = False  # whether the client reads answers in compact form
         self._sender = Sender(
             engine, "websocket", caller=caller, has_left=connection.has_left, can_move=True
         )
@@ -58,8 +61,12 @@ class RequestStream(MessageHandler):
                 self._connection.send(messages.probe_answer(len(message)))
                 return
 
+            decode = partial(decode_requests, message)
+            if is_compact(message):
+                self._answers_compact = True
+                decode = partial(self._reader.read_stream, message)
             self._connection.decode(
-                partial(decode_requests, message),
+                decode,
                 admission,
                 partial(self._submit, incoming, admission, len(message), arrived),
                 partial(self._refuse, incoming),
@@ -113,4 +120,7 @@ class RequestStream(MessageHandler):
         self.deliver(incoming)
 
     def _send(self, message: IncomingMessage) -> None:
-        self._connection.send(answers.as_frame(message))
+        compact = answers.as_compact(message) if self._answers_compact else None
+        self._connection.send(
+            answers.as_frame(message) if compact is None else STREAM_TAG + compact
+        )

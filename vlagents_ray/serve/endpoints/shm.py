@@ -28,7 +28,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
-from vlagents_ray.protocol import shm_layout
+from vlagents_ray.protocol import compact
 from vlagents_ray.protocol.frames import Decoded, decode_requests, encode_replies
 from vlagents_ray.protocol.messages import (
     OPS,
@@ -165,7 +165,7 @@ class UnixConnection(PolledConnection):
         self._ops = server.ops
         self._payload = server.payload()
         enable_timestamps(connection)
-        self._reader = shm_layout.ShmReader(server.limits)
+        self._reader = compact.CompactReader(server.limits)
         self._connected_at = time.monotonic()
         self._key: bytes | None = None  # the key as the client has sent it
         # Sender of the requests; None until the client has sent its key.
@@ -274,7 +274,7 @@ class UnixConnection(PolledConnection):
 
         if self._is_rated:
             charge.require()
-        decoded = Decoded(self._reader.read(text, memory), {})
+        decoded = self._reader.read(text, memory)
         message.decoded(decoded)
         sender.send(message, decoded, self, waited_s=waited_s)
 

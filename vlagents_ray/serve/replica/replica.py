@@ -300,6 +300,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             "parts": self._parts.describe(),
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),
+            "compact": True,  # WebSockets accept `vlagents_ray.protocol.compact`
         }
 
     # Clients inside the cluster: `ClientApi`.

@@ -1,11 +1,15 @@
-"""A compact form of acts between two processes of one machine, which omits the fields that are the
-same at each step.
+"""A compact form of acts with raw images, which omits the fields that are the same at each step.
 
 An observation's layout (session, priority, names and sizes of cameras and state) is sent once, as
-JSON. Later messages refer to the layout by its number. The remaining part of a request is an `ITEM`
-and its arrays, which are stored in sequence in shared memory, each at an offset that is a multiple
-of 64. A reply consists of an `ANSWER`, the action, and the `WEIGHTS` that computed the action. All
-other messages (a reset, `info`, an error) are sent as frames; see `vlagents_ray.protocol.frames`.
+JSON. Later messages of the connection refer to the layout by its number. The remaining part of a
+request is an `ITEM` and its arrays, which are stored in sequence, each at an offset that is a
+multiple of 64. A reply consists of an `ANSWER`, the action, and the `WEIGHTS` that computed the
+action. All other messages (a reset, `info`, an error) are sent as frames; see
+`vlagents_ray.protocol.frames`.
+
+Processes of one machine store the arrays in shared memory. On a WebSocket, a message is a
+`STREAM_TAG`, the size of the text, the text and the arrays, and its answer is a `STREAM_TAG` and
+the replies. Only the Python client sends this form, if the server's metadata have `compact`.
 """
 
 from __future__ import annotations
@@ -21,19 +25,29 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.interface import POLICY, Act, Obs
-from vlagents_ray.protocol.frame_layout import Buffer
-from vlagents_ray.protocol.frames import check_request
-from vlagents_ray.protocol.messages import MessageLimits, PriorityName, Reply, Request, is_name
+from vlagents_ray.protocol.frame_layout import Buffer, parse_json
+from vlagents_ray.protocol.frames import Decoded, check_request
+from vlagents_ray.protocol.messages import (
+    Budget,
+    MessageLimits,
+    PriorityName,
+    Reply,
+    Request,
+    is_name,
+)
 from vlagents_ray.protocol.values import require_array_name
 
 _ALIGN = 64
 _ID_BYTES = 40  # maximum length of a request's id
-_MAX_LAYOUTS = 1024  # maximum number of layouts of one connection
+# Maximum number of layouts of one connection, and of the bytes of their texts.
+_MAX_LAYOUTS, _LAYOUTS_BYTES = 1024, 2**18
 _NONE = float("nan")
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
+STREAM_TAG = b"VLAc"
+_STREAM_HEAD = struct.Struct("<4sI")  # tag, size of the text, bytes
 COUNT = struct.Struct("<I")
 # An act: number of its layout, size of the layout's JSON, step or -1, deadline in ms, gripper,
 # request id.
@@ -109,10 +123,11 @@ class Layout:
         return arrays
 
 
-class ShmWriter:
+class CompactWriter:
     """Writes the acts of one connection, and remembers the layouts that the receiver has."""
 
     def __init__(self) -> None:
+        self._text_bytes = 0  # size of the texts of all layouts
         self._known: dict[Any, tuple[int, Layout]] = {}
         # The layout of the last act of each session; its next act probably has the same layout.
         self._latest: dict[str, tuple[int, Layout]] = {}
@@ -125,7 +140,7 @@ class ShmWriter:
         arrays: list[tuple[int, np.ndarray]] = []
         new: dict[Any, tuple[int, Layout]] = {}
         latest: dict[str, tuple[int, Layout]] = {}
-        at = 0
+        at, text_bytes = 0, self._text_bytes
         for request in requests:
             text = b""
             known = self._latest.get(request.session)
@@ -137,10 +152,11 @@ class ShmWriter:
                 known = self._known.get(key) or new.get(key)
                 if known is None:
                     number = len(self._known) + len(new)
-                    if number >= _MAX_LAYOUTS:
+                    text = json.dumps(key).encode()
+                    text_bytes += len(text)
+                    if number >= _MAX_LAYOUTS or text_bytes > _LAYOUTS_BYTES:
                         return None
                     known = new[key] = (number, Layout.from_shapes(*key))
-                    text = json.dumps(key).encode()
                     texts.append(text)
                 latest[request.session] = known
                 placed = known[1].placed(request, at) or []
@@ -162,6 +178,7 @@ class ShmWriter:
         if latest:
             self._known |= new
             self._latest |= latest
+            self._text_bytes = text_bytes
         return Written(b"".join(items + texts), max(at, _ALIGN), arrays)
 
 
@@ -186,16 +203,46 @@ class Written:
         pieces.append(bytes(self.size - end))
         return pieces
 
+    def stream_parts(self) -> list[Buffer]:
+        """Return the pieces of a message on a WebSocket, in order."""
+        head = _STREAM_HEAD.pack(STREAM_TAG, len(self.message)) + self.message
+        return [head, bytes(-len(head) % _ALIGN), *self.parts()]
 
-class ShmReader:
+
+class CompactReader:
     """Reads the acts of one connection."""
 
     def __init__(self, limits: MessageLimits) -> None:
         self._limits = limits
         self._known: dict[int, Layout] = {}
+        self._text_bytes = 0  # size of the texts of all layouts
 
-    def read(self, message: memoryview, memory: np.ndarray) -> list[Request]:
+    def read_stream(self, message: bytes, budget: Budget) -> Decoded:
+        """Return the requests of a message on a WebSocket, whose arrays are views of the message.
+
+        Raises:
+            InvalidInput: The message is malformed.
+            TooManyRequests: The sender's key is over its rate.
+        """
+        budget.begin_message()
+        if len(message) < _STREAM_HEAD.size:
+            raise MalformedMessage(
+                f"act: expected at least {_STREAM_HEAD.size} bytes, got {len(message)}"
+            )
+        _, size = _STREAM_HEAD.unpack_from(message)
+        end = _STREAM_HEAD.size + size
+        text = memoryview(message)[_STREAM_HEAD.size : end]
+        arrays = np.frombuffer(message, np.uint8)[end + -end % _ALIGN :]
+        return self.read(text, arrays, budget)
+
+    def read(
+        self, message: memoryview, memory: np.ndarray, budget: Budget | None = None
+    ) -> Decoded:
         """Return the requests of a message, whose arrays are views of `memory`, (N,) uint8.
+
+        Args:
+            budget: The budget of the message, which may reject each request; None for memory of a
+                process of the same user.
 
         Raises:
             InvalidInput: The message is malformed.
@@ -204,28 +251,22 @@ class ShmReader:
             (count,) = COUNT.unpack_from(message)
             if count > self._limits.requests:
                 raise MessageTooLarge(
-                    f"local: expected at most {self._limits.requests} acts in one message, got "
+                    f"act: expected at most {self._limits.requests} acts in one message, got "
                     f"{count}"
                 )
 
             text_at = COUNT.size + count * ITEM.size
-            requests = []
+            decoded = Decoded([], {})
             at = 0
-            for item in ITEM.iter_unpack(message[COUNT.size : text_at]):
+            for index, item in enumerate(ITEM.iter_unpack(message[COUNT.size : text_at])):
                 number, text_bytes, step, deadline_ms, gripper, request_id = item
                 if text_bytes:
-                    if number >= _MAX_LAYOUTS:
-                        raise MessageTooLarge(
-                            f"local: expected a layout below {_MAX_LAYOUTS}, got {number}"
-                        )
-                    self._known[number] = self._layout(
-                        bytes(message[text_at : text_at + text_bytes])
-                    )
+                    self._learn(number, bytes(message[text_at : text_at + text_bytes]))
                     text_at += text_bytes
                 layout = self._known[number]
                 if at + layout.size > memory.size:
                     raise MalformedMessage(
-                        f"local: expected at least {at + layout.size} bytes of memory for the "
+                        f"act: expected at least {at + layout.size} bytes of memory for the "
                         f"arrays, got {memory.size}"
                     )
 
@@ -234,7 +275,7 @@ class ShmReader:
                 # `isalnum` is faster than `is_name`, and most ids pass it.
                 if not id_bytes.isalnum() and not is_name(name_of_request):
                     raise MalformedMessage(
-                        "local: request_id: expected visible ASCII characters, got "
+                        "act: request_id: expected visible ASCII characters, got "
                         f"{name_of_request!r}"
                     )
 
@@ -254,27 +295,48 @@ class ShmReader:
                     request_id=name_of_request,
                     deadline_ms=None if math.isnan(deadline_ms) else deadline_ms,
                 )
-                requests.append(request)
+                try:
+                    if budget is not None:
+                        budget.begin("act", layout.priority)
+                        budget.count(layout.size)
+                except VLAgentsError as error:
+                    decoded.refused[index] = Reply(name_of_request, error=error)
+                else:
+                    decoded.requests.append(request)
         except (struct.error, ValueError, KeyError, TypeError) as error:
             if isinstance(error, InvalidInput):
                 raise
-            raise MalformedMessage(
-                f"local: not an act ({type(error).__name__}: {error})"
-            ) from error
+            raise MalformedMessage(f"act: not an act ({type(error).__name__}: {error})") from error
 
-        if len(requests) != count or not count:
+        found = len(decoded.requests) + len(decoded.refused)
+        if found != count or not count:
             raise MalformedMessage(
-                f"local: expected {count} acts, as the message announces, got {len(requests)}"
+                f"act: expected {count} acts, as the message announces, got {found}"
             )
-        return requests
+        return decoded
+
+    def _learn(self, number: int, text: bytes) -> None:
+        """Remember a layout; raise an error if it exceeds the limits of a connection."""
+        if number >= _MAX_LAYOUTS:
+            raise MessageTooLarge(f"act: expected a layout below {_MAX_LAYOUTS}, got {number}")
+        if number == 0:  # the client begins again, after a message was rejected
+            self._known.clear()
+            self._text_bytes = 0
+        self._text_bytes += len(text)
+        if self._text_bytes > _LAYOUTS_BYTES:
+            raise MessageTooLarge(
+                f"act: expected layouts of at most {_LAYOUTS_BYTES} bytes in all, got "
+                f"{self._text_bytes}"
+            )
+        self._known[number] = self._layout(text)
 
     def _layout(self, text: bytes) -> Layout:
         """Read a layout, the JSON text of a `_key`; raise an error if it exceeds the limits."""
         limits = self._limits
-        session, priority, cameras, state = json.loads(text)
+        session, priority, cameras, state = parse_json(text, "act: the layout is")
         check_request(Request("close", session=session, priority=priority), limits)
         if not isinstance(cameras, list) or not isinstance(state, list):
-            raise MalformedMessage("local: expected lists of names and shapes as cameras and state")
+            raise MalformedMessage("act: expected lists of names and shapes as cameras and state")
         if max(len(cameras), len(state)) > limits.cameras:
             raise MessageTooLarge(
                 f"obs: expected at most {limits.cameras} cameras and states, got {len(cameras)} "
@@ -287,19 +349,19 @@ class ShmReader:
         ):
             if not isinstance(name, str) or not isinstance(shape, list) or len(shape) != dimensions:
                 raise MalformedMessage(
-                    f"local: expected a name and {dimensions} dimensions, got {name!r} of {shape!r}"
+                    f"act: expected a name and {dimensions} dimensions, got {name!r} of {shape!r}"
                 )
             require_array_name(name)
             if not all(type(n) is int and n >= 0 for n in shape) or (
                 dimensions == 3 and shape[2] != 3
             ):
                 raise MalformedMessage(
-                    f"local: {name!r}: expected a shape (H, W, 3) or (D,), got {shape!r}"
+                    f"act: {name!r}: expected a shape (H, W, 3) or (D,), got {shape!r}"
                 )
             size = math.prod(shape[:2])
             if size > max_size:
                 raise MessageTooLarge(
-                    f"local: {name!r}: expected at most {max_size} pixels or values, got {size}"
+                    f"act: {name!r}: expected at most {max_size} pixels or values, got {size}"
                 )
         return Layout.from_shapes(session, priority, cameras, state)
 
@@ -335,6 +397,11 @@ def _key(request: Request) -> tuple[Any, ...] | None:
         tuple([(name, image.shape) for name, image in obs.cameras.items()]),
         tuple([(name, values.shape) for name, values in obs.state.items()]),
     )
+
+
+def is_compact(message: Buffer) -> bool:
+    """Return whether a message on a WebSocket is in compact form."""
+    return message[: len(STREAM_TAG)] == STREAM_TAG
 
 
 def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:

@@ -18,18 +18,18 @@ from many import many
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, PolicyFailed
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.protocol import shm_layout
-from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
-from vlagents_ray.protocol.shm_layout import (
+from vlagents_ray.protocol import compact
+from vlagents_ray.protocol.compact import (
     ANSWER,
     COUNT,
     ITEM,
-    ShmReader,
-    ShmWriter,
+    CompactReader,
+    CompactWriter,
     Written,
     read_answers,
     write_answers,
 )
+from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
 
 images = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3)))
 states = hnp.arrays(np.float32, st.integers(0, 9), elements=st.floats(-1e6, 1e6, width=32))
@@ -66,13 +66,17 @@ def test_acts_come_back_as_they_were_also_when_their_layout_is_known(
         )
         for i, obs in enumerate(seen)
     ]
-    writer, reader = ShmWriter(), ShmReader(MessageLimits())
+    writer, reader = CompactWriter(), CompactReader(MessageLimits())
     sizes = []
     for _ in range(2):
         written = writer.write(sent)
         sizes.append(len(written.message))
         for i, (one, obs) in enumerate(
-            zip(reader.read(memoryview(written.message), placed(written)), seen, strict=True)
+            zip(
+                reader.read(memoryview(written.message), placed(written)).requests,
+                seen,
+                strict=True,
+            )
         ):
             assert (one.op, one.session, one.priority, one.step) == (
                 "act",
@@ -96,10 +100,10 @@ def seeing(side: int, session: str = "s") -> Request:
 
 
 def test_a_session_may_change_what_it_sees_even_within_a_message() -> None:
-    writer, reader = ShmWriter(), ShmReader(MessageLimits())
+    writer, reader = CompactWriter(), CompactReader(MessageLimits())
     for sides in ((4,), (5,), (4,), (4, 5, 4), (6, 6), (4, 4)):
         written = writer.write([seeing(side) for side in sides])
-        read = reader.read(memoryview(written.message), placed(written))
+        read = reader.read(memoryview(written.message), placed(written)).requests
         assert [one.obs.cameras["front"].shape[0] for one in read if one.obs] == list(sides)
         assert [one.obs.cameras["front"][0, 0, 0] for one in read if one.obs] == list(sides)
 
@@ -116,11 +120,11 @@ def test_a_session_may_change_what_it_sees_even_within_a_message() -> None:
     ids=["priority", "session", "name", "more", "less"],
 )
 def test_what_is_not_like_the_last_act_has_a_layout_of_its_own(change: dict[str, Any]) -> None:
-    writer, reader = ShmWriter(), ShmReader(MessageLimits())
+    writer, reader = CompactWriter(), CompactReader(MessageLimits())
     for request in (seeing(4), replace(seeing(4), **change)):
         written = writer.write([request])
         assert len(written.message) > COUNT.size + ITEM.size
-        [read] = reader.read(memoryview(written.message), placed(written))
+        [read] = reader.read(memoryview(written.message), placed(written)).requests
         assert (read.session, read.priority) == (request.session, request.priority)
         assert (list(read.obs.cameras), list(read.obs.state)) == (
             list(request.obs.cameras),
@@ -129,10 +133,17 @@ def test_what_is_not_like_the_last_act_has_a_layout_of_its_own(change: dict[str,
 
 
 def test_nothing_of_a_message_that_travels_as_a_frame_is_taken_for_known() -> None:
-    writer = ShmWriter()
+    writer = CompactWriter()
     assert writer.write([seeing(4), Request("reset", Obs())]) is None
     written = writer.write([seeing(4)])
-    assert len(ShmReader(MessageLimits()).read(memoryview(written.message), placed(written))) == 1
+    assert (
+        len(
+            CompactReader(MessageLimits())
+            .read(memoryview(written.message), placed(written))
+            .requests
+        )
+        == 1
+    )
 
 
 @pytest.mark.parametrize(
@@ -149,7 +160,7 @@ def test_nothing_of_a_message_that_travels_as_a_frame_is_taken_for_known() -> No
     ],
 )
 def test_what_does_not_fit_travels_as_a_frame(request_: Request) -> None:
-    assert ShmWriter().write([Request("act", Obs()), request_]) is None
+    assert CompactWriter().write([Request("act", Obs()), request_]) is None
 
 
 @given(st.binary(max_size=300))
@@ -158,7 +169,7 @@ def test_what_does_not_fit_travels_as_a_frame(request_: Request) -> None:
 @example(COUNT.pack(1) + ITEM.pack(0, 2**31, 0, 0.0, 0.0, b"r"))
 def test_garbage_is_refused_by_name(data: bytes) -> None:
     with pytest.raises(InvalidInput):
-        ShmReader(MessageLimits()).read(memoryview(data), np.zeros(64, np.uint8))
+        CompactReader(MessageLimits()).read(memoryview(data), np.zeros(64, np.uint8))
 
 
 @pytest.mark.parametrize(
@@ -185,7 +196,7 @@ def test_layouts_are_checked(layout: object) -> None:
     text = json.dumps(layout).encode()
     message = COUNT.pack(1) + ITEM.pack(0, len(text), -1, 1.0, 0.5, b"r") + text
     with pytest.raises(InvalidInput):
-        ShmReader(MessageLimits()).read(memoryview(message), np.zeros(4096, np.uint8))
+        CompactReader(MessageLimits()).read(memoryview(message), np.zeros(4096, np.uint8))
 
 
 @given(
@@ -265,9 +276,9 @@ def test_answers_with_more_in_them_travel_as_a_frame() -> None:
 
 def test_names_forge_no_line_in_a_log() -> None:
     for names in ({"request_id": "a\nb"}, {"session": "a\nb"}):
-        written = ShmWriter().write([Request("act", Obs(), **names)])
+        written = CompactWriter().write([Request("act", Obs(), **names)])
         with pytest.raises(MalformedMessage):
-            ShmReader(MessageLimits()).read(memoryview(written.message), placed(written))
+            CompactReader(MessageLimits()).read(memoryview(written.message), placed(written))
 
 
 class WritersAndReaders(RuleBasedStateMachine):
@@ -284,7 +295,7 @@ class WritersAndReaders(RuleBasedStateMachine):
 
     @rule()
     def reconnect(self) -> None:
-        self.writer, self.reader = ShmWriter(), ShmReader(MessageLimits(requests=8))
+        self.writer, self.reader = CompactWriter(), CompactReader(MessageLimits(requests=8))
 
     def written(
         self, sides: list[int], sessions: list[int]
@@ -302,7 +313,7 @@ class WritersAndReaders(RuleBasedStateMachine):
         requests, written = self.written(sides, sessions)
         if written is None:
             return  # sent as a frame
-        read = self.reader.read(memoryview(written.message), placed(written))
+        read = self.reader.read(memoryview(written.message), placed(written)).requests
         assert [request.session for request in read] == [request.session for request in requests]
         for sent, got in zip(requests, read, strict=True):
             np.testing.assert_array_equal(got.obs.cameras["front"], sent.obs.cameras["front"])
@@ -315,7 +326,7 @@ class WritersAndReaders(RuleBasedStateMachine):
     def send_in_vain(self, sides: list[int], sessions: list[int]) -> None:
         """Write a message that is over the rate, or that is not sent in time."""
         self.written(sides, sessions)
-        self.writer = ShmWriter()
+        self.writer = CompactWriter()
 
     @rule(side=st.integers(1, 3), session=st.integers(0, 4))
     def be_refused_behind_the_layout(self, side: int, session: int) -> None:
@@ -330,14 +341,14 @@ class WritersAndReaders(RuleBasedStateMachine):
         message = count + rest[: ITEM.size] + wrong + rest[ITEM.size :]
         with pytest.raises(InvalidInput):
             self.reader.read(memoryview(message), placed(written))
-        self.writer = ShmWriter()
+        self.writer = CompactWriter()
 
 
 @pytest.fixture(autouse=True)
 def few_layouts(request: pytest.FixtureRequest) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         if "layout" in request.node.name:
-            patch.setattr(shm_layout, "_MAX_LAYOUTS", 4)
+            patch.setattr(compact, "_MAX_LAYOUTS", 4)
         yield
 
 
@@ -348,7 +359,7 @@ def test_a_writer_and_a_reader_agree_on_layouts_whatever_was_lost_or_refused() -
 
 
 def test_a_reader_takes_no_layout_beyond_the_limit_and_no_message_of_too_many_acts() -> None:
-    reader = ShmReader(MessageLimits(requests=2))
+    reader = CompactReader(MessageLimits(requests=2))
     text = json.dumps(["s", "robot", [], []]).encode()
     item = ITEM.pack(4, len(text), -1, float("nan"), float("nan"), b"")
     with pytest.raises(InvalidInput, match="below 4"):
@@ -363,6 +374,6 @@ def test_names_have_the_limits_of_a_frame_in_layouts_also(name: str) -> None:
     text = json.dumps(["s", "robot", [], [[name, [1]]]]).encode()
     item = ITEM.pack(0, len(text), -1, float("nan"), float("nan"), b"")
     with pytest.raises(InvalidInput, match="named"):
-        ShmReader(MessageLimits()).read(
+        CompactReader(MessageLimits()).read(
             memoryview(COUNT.pack(1) + item + text), np.zeros(64, np.uint8)
         )
