@@ -14,17 +14,21 @@ import argparse
 import bisect
 import heapq
 import itertools
+import json
 import math
 import random
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from in_flight import AnySession, message_of_one
 
+from benchmarks.robot_process import executed_by_waiting
+from benchmarks.robots import RobotsPlan
 from benchmarks.successful import CHECKPOINT, FleetSuccess, ServedRobot, curve_of
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.messages import Priority, Request
@@ -68,8 +72,8 @@ class Robot:
     states_slack: bool = True
     lies: bool = False  # whether it claims in each request to be about to run out of rows
     obeys: bool = True  # whether it replans at the requested pace
-    # Whether it executes a chunk, and then waits for the next one, like the loops of openpi and
-    # vlagents.
+    # Whether it executes half of a chunk, and then waits for the next one, like the loops of openpi
+    # and vlagents.
     stops: bool = False
     source: str = ""
     executed: int = 0  # number of executed rows
@@ -198,19 +202,19 @@ class World:
             robot.late_s = self.now
 
     def _stop(self, robot: Robot) -> None:
-        """Stop after the last row of a chunk, request the next chunk, and execute all its rows."""
+        """Stop, request the next chunk, and execute half of its rows."""
         at, period_s = self.now, 1 / robot.hz
+        rows = executed_by_waiting(robot.rows)
 
         def move() -> None:
-            # The first row is due in any case one tick after the last row of the previous chunk.
-            first = max(self.now, at + period_s)
+            waited_s = self.now - at
             if at >= self.measured_from:
-                robot.ticks += robot.rows
-                robot.waits.append((first - at) * robot.hz - 1)
+                robot.ticks += rows
+                robot.waits.append(waited_s * robot.hz)
                 robot.delays.append(0)
-                robot.ages += [first - at + row * period_s for row in range(robot.rows)]
+                robot.ages += [waited_s + row * period_s for row in range(rows)]
             robot.begun = True
-            self.at(first + (robot.rows - 1) * period_s, lambda: self._stop(robot))
+            self.at(self.now + rows * period_s, lambda: self._stop(robot))
 
         self._ask(robot, 0.0, at, move)
 
@@ -541,9 +545,15 @@ compute one request at a time, and their loops wait for each chunk.
 """
 
 
-def print_successful(checkpoint: Path) -> None:
-    """Print the largest fleets of successful robots and their tasks per GPU-hour, and those of
-    fleets whose sizes are shares of this server's largest fleet.
+LOADS = (0.25, 0.7, 1.05)  # numbers of robots, relative to the capacity (`RobotsPlan.capacity`)
+
+
+def successful(checkpoint: Path) -> dict[str, Any]:
+    """Return the largest fleets of successful robots, and the figures of fleets of fixed sizes, as
+    JSON; print them as they come.
+
+    Args:
+        checkpoint: The folder of the checkpoint whose success is assumed.
 
     Raises:
         ConfigError: The success of the checkpoint was not measured.
@@ -554,24 +564,31 @@ def print_successful(checkpoint: Path) -> None:
         if curve is None:
             raise ConfigError(
                 f"{checkpoint}: expected its success with the loop {loop!r}, got none; measure it "
-                "with `python -m benchmarks.delays`"
+                "with `python -m benchmarks.delays --curves`"
             )
         curves[stops] = curve
         print(f"{loop}: tolerated delay {curve.tolerated} rows; {curve.mode}, {curve.settings}")
-    print("rows  system  largest successful fleet: tasks per GPU-hour | the same of 70 %, 105 %")
-    for rows in (8, 50):
-        most = 0
-        for name, system in SYSTEMS.items():
-            kind, curve = (rows, 10.0), curves[system.stops]
-            number = system.largest(curve, kind)
-            most = most or number
-            tasks = system.play(number, kind).success(curve).tasks_per_gpu_hour if number else 0.0
-            texts = []
-            for share in (0.7, 1.05):
-                size = round(share * most)
-                success = system.play(size, kind).success(curve)
-                texts.append(f"{success.successful} of {size}: {success.tasks_per_gpu_hour:.0f}")
-            print(f"{rows:4}  {name:36} {number:4}: {tasks:.0f} | {', '.join(texts)}", flush=True)
+
+    print("simulated: rows, system, robots: successful, tasks per GPU-hour")
+    entries = []
+    for rows, (name, system) in itertools.product((8, 50), SYSTEMS.items()):
+        kind, curve = (rows, 10.0), curves[system.stops]
+        capacity = RobotsPlan().capacity(str(rows))
+        largest = system.largest(curve, kind)
+        fleets = []
+        for number in (largest, *(round(load * capacity) for load in LOADS)):
+            found = FleetSuccess(0, 0.0)
+            if number:
+                found = system.play(number, kind).success(curve)
+            fleets.append({"robots": number, **asdict(found)})
+            print(f"{rows:3} {name:36} {number:4}: {found}", flush=True)
+        entries.append({"rows": rows, "system": name, "largest": fleets[0], "fleets": fleets[1:]})
+    return {
+        "curves": {
+            "waiting" if stops else "player": one.to_json() for stops, one in curves.items()
+        },
+        "systems": entries,
+    }
 
 
 @dataclass(frozen=True)
@@ -748,12 +765,15 @@ def main() -> None:
         default=CHECKPOINT,
         help="the checkpoint whose success is assumed",
     )
+    parser.add_argument("--out", type=Path, help="with --successful: file for the figures, as JSON")
     options = parser.parse_args()
     if options.beside:
         print_beside(options.first, options.seeds, options.others)
         return
     if options.successful:
-        print_successful(options.checkpoint)
+        found = successful(options.checkpoint)
+        if options.out is not None:
+            options.out.write_text(json.dumps(found, indent=1) + "\n")
         return
 
     began = time.monotonic()

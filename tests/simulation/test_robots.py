@@ -197,7 +197,8 @@ def test_the_delay_of_an_answer_is_the_time_for_which_a_moving_robot_waits_for_i
     """A lone robot is answered after one batch and two ways of the network: within one tick."""
     robot = SYSTEMS[name].play(1, (rows, 10.0)).robots[0]
     assert set(robot.delays) == {0 if SYSTEMS[name].stops else 1}
-    assert sum(robot.waits) == pytest.approx(0)
+    assert all(0.41 < wait < 0.43 for wait in robot.waits)
+    assert bool(robot.waits) == SYSTEMS[name].stops
     assert robot.starved == 0
     assert robot.served().is_successful(CURVE)
 
@@ -206,12 +207,13 @@ def test_a_loop_waits_for_the_batches_before_its_own() -> None:
     costs = CostCurve(0.3, 0.0)
     robot = Robot("waits", 10.0, 8, stops=True)
     world = World(costs, [robot], jitter=0.0).run(30.0)
-    # 0.3 s and 4 ms, of which one tick belongs to the last row of the chunk before.
-    assert {round(wait, 6) for wait in robot.waits} == {2.04}
-    assert robot.ticks == 8 * len(robot.waits)
-    assert robot.served().ticks == pytest.approx(10.04 * len(robot.waits))
+    # 0.3 s, and 4 ms of the network.
+    assert {round(wait, 6) for wait in robot.waits} == {3.04}
+    assert robot.ticks == 4 * len(robot.waits)
+    assert robot.served().ticks == pytest.approx(7.04 * len(robot.waits))
+    # A wait is chosen for three ticks, and 0.04 of 7.04 are less than 2 %.
     assert world.success(CURVE).successful == 1
-    moving = 8 / 10.04
+    moving = 4 / 7.04
     assert world.success(CURVE).tasks_per_gpu_hour == pytest.approx(moving / 25 * 36_000)
 
 
