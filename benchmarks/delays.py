@@ -219,12 +219,19 @@ class Measurement:
             )
 
 
-def clock_of(mode: Mode, delay: int | tuple[int, ...], hz: float) -> ClockConfig:
-    """Return the clock of a mode, with a delay in rows at a rate."""
+def clock_of(
+    mode: Mode,
+    delay: int | tuple[int, ...],
+    hz: float,
+    settings: Mapping[str, Any] | None = None,
+) -> ClockConfig:
+    """Return the clock of a mode, with a delay in rows at a rate, and further settings."""
     rows = [delay] if isinstance(delay, int) else list(delay)
     latencies_s = [count / hz for count in rows]
     return ClockConfig(
-        latency=latencies_s[0] if isinstance(delay, int) else latencies_s, **mode.clock
+        latency=latencies_s[0] if isinstance(delay, int) else latencies_s,
+        **mode.clock,
+        **(settings or {}),
     )
 
 
@@ -337,6 +344,9 @@ def main(
     ] = 25,
     modes: Annotated[str, typer.Option(help="Modes, separated by semicolons; default: all.")] = "",
     delays: Annotated[str, typer.Option(help="Delays, as in the table; default: all.")] = "",
+    clock_set: Annotated[
+        list[str], typer.Option("--clock", help="Setting of the clock, NAME=VALUE.")
+    ] = [],  # noqa: B006
     position: Annotated[
         str, typer.Option(help="Part of the state with the tool's position; empty: none.")
     ] = "xyzrpy",
@@ -353,13 +363,15 @@ def main(
     with errors():
         chosen_modes = _chosen(modes, MODES, "--modes")
         chosen_delays = _chosen(delays, DELAYS, "--delays")
-        overrides = parse_overrides([*settings, "execute=null"], "--set")
-        overrides = [override.below("config") for override in overrides]
+        overrides = [change.below("config") for change in parse_overrides(settings, "--set")]
         overrides += parse_overrides([f"batch.max_size={batch}"], "--batch")
         app = only_application(policy, read_deployment(policy, overrides=overrides))
-        agent = LocalPolicy(ServerArgs.model_validate(app.args), own_settings(app))
+        config = own_settings(app)
+        config.pop("execute", None)  # the evaluation executes a part of the chunk, not the policy
+        agent = LocalPolicy(ServerArgs.model_validate(app.args), config)
         agent.initialize()
-        if env == "tabletop" and not env_set:
+        of_clock = parse_settings(clock_set, "--clock")
+        if env in ("tabletop", "benchmarks.absolute:AbsoluteTabletop") and not env_set:
             env_set = [*TABLETOP]
         part, options = position or None, parse_settings(env_set, "--env-set")
         measured = Measurement(
@@ -369,7 +381,7 @@ def main(
         rows = [row(SYNCHRONOUS, "0", synchronous, synchronous, hz)]
         for name in chosen_modes:
             for delay in chosen_delays:
-                clock = clock_of(MODES[name], DELAYS[delay], hz)
+                clock = clock_of(MODES[name], DELAYS[delay], hz, of_clock)
                 found = measured.episodes(f"{name} {delay}", clock, episodes)
                 rows.append(row(name, delay, found, synchronous, hz))
                 out.print(f"{name}, {delay}: {rows[-1]['solved']} of {episodes}")

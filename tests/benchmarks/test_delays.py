@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,23 @@ import pytest
 import typer
 
 from benchmarks import delays
+from benchmarks.absolute import AbsoluteTabletop, FromFirstPose
 from benchmarks.delays import Episode, curves, jerk, oscillation, row
+from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.success import SuccessCurve, read_curves
 
 HZ = 10.0
+
+
+class Fixed(Agent):
+    """Returns one answer."""
+
+    def __init__(self, answer: Act) -> None:
+        self.answer = answer
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        return [self.answer for _ in obs]
 
 
 def episodes(*solved: bool, ticks: int = 20, digest: str = "a") -> list[Episode]:
@@ -93,6 +107,7 @@ def test_it_measures_the_reference_policy_and_writes_its_curves(tmp_path: Path) 
             "deployments/reference.yaml",
             "tabletop",
             env_set=[],
+            clock_set=[],
             settings=[],
             execute=4,
             episodes=2,
@@ -125,4 +140,24 @@ def test_it_measures_the_reference_policy_and_writes_its_curves(tmp_path: Path) 
 
 def test_unknown_names_are_rejected_with_the_known_ones() -> None:
     with pytest.raises(typer.Exit):
-        delays.main(modes="asynchronous", settings=[], env_set=[])
+        delays.main(modes="asynchronous", settings=[], env_set=[], clock_set=[])
+
+
+def test_absolute_actions_lead_to_the_same_poses_as_relative_ones() -> None:
+    options = {"width": 64, "height": 64, "max_steps": 30}
+    relative, absolute = Tabletop(**options), AbsoluteTabletop(**options)
+    assert absolute.contract.action.delta is False
+    obs, _ = relative.reset(seed=3)
+    absolute.reset(seed=3)
+    rows = np.random.default_rng(0).uniform(-1.5, 1.5, (10, 4)).astype(np.float32)
+    rows[:, 1] = -np.abs(rows[:, 1]) / 4  # away from the limits of the reach
+    rows[:, 2] /= 8
+    rows[:, 0] /= 2
+    [act] = FromFirstPose(Fixed(Act(rows))).act_batch([obs], [FromFirstPose(Fixed(Act(rows)))])
+    assert isinstance(act, Act)
+    targets = act.action + np.append(obs.state["xyzrpy"][:3], 0.0)
+    for row_of_chunk, target in zip(rows, targets, strict=True):
+        there, *_ = relative.step(Act(row_of_chunk))
+        here, *_ = absolute.step(Act(target.astype(np.float32)))
+        np.testing.assert_allclose(here.state["xyz"], there.state["xyzrpy"][:3], atol=1e-6)
+        assert here.gripper == pytest.approx(there.gripper)
