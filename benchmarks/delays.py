@@ -66,18 +66,18 @@ _WINDOW_S = 0.5
 
 @dataclass(frozen=True)
 class Mode:
-    """A mode of executing chunks: its settings in an evaluation, and as a chunk player has them."""
+    """A mode of executing chunks, in an evaluation and in the chunk player."""
 
-    clock: Mapping[str, Any] = field(default_factory=dict)  # settings of `ClockConfig`
-    mode: str = "async"  # mode of the chunk player
-    player: Mapping[str, Any] = field(default_factory=dict)  # settings of `PlayerSettings`
+    mode: str = "async"
+    # Other settings, which `ClockConfig` and `PlayerSettings` share.
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 MODES = {
-    "stop and wait": Mode({"meanwhile": "zero"}, "open_loop"),
+    "stop and wait": Mode("open_loop"),
     "async": Mode(),
-    "async, grips at once": Mode({"fresh_grip": None}, "async", {"fresh_grip": None}),
-    "prefixes": Mode({"real_time_chunking": True}, "async", {"real_time_chunking": True}),
+    "async, grips at once": Mode("async", {"fresh_grip": None}),
+    "prefixes": Mode("async", {"real_time_chunking": True}),
 }
 SYNCHRONOUS = "synchronous"
 
@@ -228,10 +228,9 @@ def clock_of(
     """Return the clock of a mode, with a delay in rows at a rate, and further settings."""
     rows = [delay] if isinstance(delay, int) else list(delay)
     latencies_s = [count / hz for count in rows]
-    return ClockConfig(
-        latency=latencies_s[0] if isinstance(delay, int) else latencies_s,
-        **mode.clock,
-        **(settings or {}),
+    latency = latencies_s[0] if isinstance(delay, int) else latencies_s
+    return ClockConfig.model_validate(
+        {"latency": latency, "mode": mode.mode, **mode.settings, **(settings or {})}
     )
 
 
@@ -280,7 +279,7 @@ def curves(
             env,
             hz,
             MODES[name].mode,
-            {"execute": execute, **MODES[name].player},
+            {"execute": execute, **MODES[name].settings},
             entries,
             weights,
         )

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlagents_ray.bounds import MOST_EPISODES, MOST_HZ, MOST_ROWS
-from vlagents_ray.errors import ConfigError, InvalidInput, shown
+from vlagents_ray.errors import ConfigError, InvalidInput, MalformedMessage, shown
 from vlagents_ray.foreign_files import read_text
 
 SUCCESS_FILE = "success.json"
@@ -243,6 +243,48 @@ def write_curves(folder: Path, curves: Iterable[SuccessCurve]) -> Path:
     document = {"curves": [curve.to_json() for curve in curves]}
     file.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return file
+
+
+def curves_in(metadata: Mapping[str, Any]) -> tuple[SuccessCurve, ...]:
+    """Return the measured success of the checkpoint in the metadata of a policy; none if a learner
+    has replaced its weights.
+
+    Raises:
+        MalformedMessage: The metadata contain no curves there.
+    """
+    curves = weights_in(metadata).get("success") or []
+    if not isinstance(curves, list):
+        raise MalformedMessage(
+            f"metadata: weights.success: expected a list of curves, got {shown(curves)}"
+        )
+    if _is_replaced(metadata.get("policy_version")):
+        return ()
+    try:
+        return tuple(SuccessCurve.from_json(curve) for curve in curves)
+    except InvalidInput as error:
+        raise MalformedMessage(f"metadata: weights.success: {error}") from error
+
+
+def weights_in(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the description of the weights in the metadata of a policy; empty if there is none.
+
+    Raises:
+        MalformedMessage: The metadata contain no description there.
+    """
+    weights = metadata.get("weights") or {}
+    if not isinstance(weights, dict):
+        raise MalformedMessage(f"metadata: weights: expected an object, got {shown(weights)}")
+    return weights
+
+
+def _is_replaced(versions: object) -> bool:
+    """Return whether the newest or the pinned weights of a policy are not those that it loaded,
+    given its `policy_version`.
+    """
+    if not isinstance(versions, dict):
+        return False
+    described = [version for version in versions.values() if isinstance(version, dict)]
+    return any(version.get("version") for version in described)
 
 
 def _is_number(value: object) -> bool:

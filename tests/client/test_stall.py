@@ -134,7 +134,9 @@ def evaluated(agent: Agent, delta: bool, stall: int) -> Run:
     is left.
     """
     contract = Contract(action=ActionSpec(dim=1, delta=delta), control_hz=HZ)
-    player = ChunkExecutor(ROWS - ANSWER, ClockConfig(latency=0.1, neutral=[0.0]), contract)
+    player = ChunkExecutor(
+        ROWS - ANSWER, ClockConfig(latency=0.1, mode="async", neutral=[0.0]), contract
+    )
     at: list[float] = []
     moved: list[float] = []
     position, fresh = 0.0, 0

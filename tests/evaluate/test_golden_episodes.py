@@ -36,6 +36,12 @@ PLANS: dict[str, tuple[str, dict[str, Any], dict[str, Any], dict[str, Any]]] = {
         {},
         {"env_options": SIZE | {"max_steps": 30}, "clock": {"latency": 0.25}},
     ),
+    "real time, async": (
+        "random",
+        CHUNKS,
+        {"execute": 4},
+        {"env_options": SIZE | {"max_steps": 30}, "clock": {"latency": 0.25, "mode": "async"}},
+    ),
 }
 
 

@@ -81,7 +81,7 @@ UNEQUAL = ActionSpec(
     [
         lambda: SafeAction("auto", UNEQUAL),
         lambda: ChunkExecutor(
-            None, ClockConfig(latency=0.1), Contract(action=UNEQUAL, control_hz=10)
+            None, ClockConfig(latency=0.1, mode="async"), Contract(action=UNEQUAL, control_hz=10)
         ),
         lambda: Guard(Contract(action=UNEQUAL)),
         lambda: SimulatedRobot(Contract(action=UNEQUAL)),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from vlagents_ray.chunking.player import PlayerSettings
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.interface import Agent, Obs
-from vlagents_ray.success import SuccessCurve
+from vlagents_ray.success import SuccessCurve, curves_in
 
 ChosenMode = Literal["auto", "open_loop", "ensemble", "async"]
 """A mode of the chunk player, or "auto", which `choose` replaces with one of them."""
@@ -162,6 +162,30 @@ def choose_for(
         hz=hz,
         delay_s=delay_s,
         **settings,
+    )
+
+
+def choose_from(metadata: Mapping[str, Any], **arguments: Any) -> Choice:
+    """Choose the mode for a policy, from the metadata of its server.
+
+    Args:
+        metadata: The metadata, as in `RemoteAgent.metadata`.
+        arguments: The other arguments of `choose`.
+
+    Returns:
+        The settings of the chunk player, and a line for the operator.
+
+    Raises:
+        ConfigError: As in `choose`.
+        MalformedMessage: The metadata have values of a wrong type.
+    """
+    contract = metadata.get("contract")
+    longest = metadata.get("longest_prefix")
+    return choose(
+        None if contract is None else Contract.from_json(contract),
+        longest_prefix=longest if type(longest) is int else 0,
+        curves=curves_in(metadata),
+        **arguments,
     )
 
 

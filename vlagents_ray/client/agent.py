@@ -7,7 +7,7 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -21,18 +21,15 @@ from vlagents_ray.client.transports.select import TransportName, select_transpor
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     ConfigError,
-    InvalidInput,
     InvalidObservation,
-    MalformedMessage,
     PolicyFailed,
-    shown,
 )
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
 from vlagents_ray.protocol.messages import PRIORITIES, PriorityName, Reply, Request
 from vlagents_ray.protocol.values import require_obs
 from vlagents_ray.registry import require
-from vlagents_ray.success import SuccessCurve
+from vlagents_ray.success import SuccessCurve, curves_in, weights_in
 from vlagents_ray.tracing import TRACEPARENT, tracer
 
 if TYPE_CHECKING:
@@ -436,45 +433,3 @@ def _deadline_s(obs: Sequence[Obs]) -> float:
                 f"info[{DEADLINE!r}]: expected milliseconds above 0, got {deadline_ms!r}"
             )
     return min(deadlines_ms, default=math.inf) / 1e3
-
-
-def curves_in(metadata: Mapping[str, Any]) -> tuple[SuccessCurve, ...]:
-    """Return the measured success of the checkpoint in the metadata of a policy; none if a learner
-    has replaced its weights.
-
-    Raises:
-        MalformedMessage: The metadata contain no curves there.
-    """
-    curves = weights_in(metadata).get("success") or []
-    if not isinstance(curves, list):
-        raise MalformedMessage(
-            f"metadata: weights.success: expected a list of curves, got {shown(curves)}"
-        )
-    if _is_replaced(metadata.get("policy_version")):
-        return ()
-    try:
-        return tuple(SuccessCurve.from_json(curve) for curve in curves)
-    except InvalidInput as error:
-        raise MalformedMessage(f"metadata: weights.success: {error}") from error
-
-
-def weights_in(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the description of the weights in the metadata of a policy; empty if there is none.
-
-    Raises:
-        MalformedMessage: The metadata contain no description there.
-    """
-    weights = metadata.get("weights") or {}
-    if not isinstance(weights, dict):
-        raise MalformedMessage(f"metadata: weights: expected an object, got {shown(weights)}")
-    return weights
-
-
-def _is_replaced(versions: object) -> bool:
-    """Return whether the newest or the pinned weights of a policy are not those that it loaded,
-    given its `policy_version`.
-    """
-    if not isinstance(versions, dict):
-        return False
-    described = [version for version in versions.values() if isinstance(version, dict)]
-    return any(version.get("version") for version in described)

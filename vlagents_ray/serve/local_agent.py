@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from vlagents_ray.client.agent import curves_in
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
@@ -22,7 +21,7 @@ from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
 from vlagents_ray.serve.sessions import SessionFinder
-from vlagents_ray.success import SuccessCurve
+from vlagents_ray.success import SuccessCurve, curves_in
 
 _LOOK_S = 0.1  # period of the checks whether another thread has loaded a checkpoint, s
 

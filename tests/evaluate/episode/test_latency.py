@@ -37,7 +37,7 @@ def played(player: ChunkExecutor, latency_s: float, rows: np.ndarray = CHUNK) ->
 
 
 def clock(**settings: Any) -> ClockConfig:
-    return ClockConfig(**{"latency": 0.2} | settings)
+    return ClockConfig(**{"latency": 0.2, "mode": "async"} | settings)
 
 
 @pytest.mark.parametrize(
@@ -50,8 +50,6 @@ def clock(**settings: Any) -> ClockConfig:
         (4, {}, LIMITED, [(0.0, [1, 2, 3, 4]), (0.1, [5, -1, 2, 4]), (0.2, [5, 6, -1, 1])]),
         # Targets need no way back.
         (4, {"neutral": [9, 9]}, ABSOLUTE, [(0.0, [1, 2, 3, 4]), (0.1, [5, 2, 3, 4])]),
-        # Without alignment, the new chunk is executed from its first row.
-        (4, {"align": False}, RELATIVE, [(0.0, [1, 2, 3, 4]), (0.2, [5, 6, 1, 2, 3, 4])]),
         # The remaining rows are executed while the policy computes. When they end, relative actions
         # stop.
         (
@@ -61,15 +59,19 @@ def clock(**settings: Any) -> ClockConfig:
             [(0.2, [0, 0, 1, 2, 3, 4]), (0.2, [5, 6, -5, 4]), (0.3, [5, 6, 0, -5, 4])],
         ),
         # Absolute actions hold the last one.
-        (4, {"neutral": [9, 9]}, ABSOLUTE, [(0.2, [9, 9, 1, 2, 3, 4]), (0.4, [5, 6, 6, 6, 3, 4])]),
-        # If holding continues a motion, the last action is repeated instead of the remaining rows.
-        # Before the first answer nothing moves.
+        (4, {"neutral": [9, 9]}, ABSOLUTE, [(0.2, [9, 9, 1, 2, 3, 4]), (0.3, [5, 6, 6, 3, 4])]),
+        # If the next request is due when an answer comes, its rows are executed after the request.
         (
-            None,
-            {"meanwhile": "hold"},
-            RELATIVE,
-            [(0.2, [0, 0, 1, 2, 3, 4, 5, 6]), (0.2, [6, 6, -6, 4, 5, 6]), (0.9, [6] * 9 + [-6])],
+            2,
+            {"neutral": [9, 9]},
+            ABSOLUTE,
+            [(0.3, [9, 9, 9]), (0.3, [1, 2, 3]), (0.3, [4, 5, 6]), (0.0, [1, 2])],
         ),
+        # By default, a request is due at each tick.
+        (None, {"neutral": [9, 9]}, ABSOLUTE, [(0.1, [9]), (0.1, [1]), (0.1, [2]), (0.0, [1])]),
+        # A robot that stops and waits executes all rows, or as many as it is told.
+        (None, {"mode": "open_loop"}, RELATIVE, [(0.2, [0, 0, 1, 2, 3, 4, 5, 6])] * 2),
+        (2, {"mode": "open_loop"}, RELATIVE, [(0.2, [0, 0, 1, 2]), (0.3, [0, 0, 0, 1, 2])]),
     ],
 )
 def test_what_is_executed_until_an_answer_comes_and_of_it(
@@ -84,27 +86,24 @@ def test_what_is_executed_until_an_answer_comes_and_of_it(
     ]
 
 
-@pytest.mark.parametrize(
-    ("meanwhile", "env"),
-    [("chunk", RELATIVE), ("zero", RELATIVE), ("chunk", ABSOLUTE), ("hold", ABSOLUTE)],
-)
-def test_no_row_is_dropped_for_ticks_at_which_the_robot_held(meanwhile: str, env: Contract) -> None:
-    player = ChunkExecutor(None, clock(meanwhile=meanwhile, neutral=[0, 0]), env)
-    for latency_s in (0.2, 30.0):
-        assert played(player, latency_s)[-6:] == [1, 2, 3, 4, 5, 6]
+@pytest.mark.parametrize("mode", ["open_loop", "async"])
+@pytest.mark.parametrize("env", [RELATIVE, ABSOLUTE], ids=["relative", "absolute"])
+def test_no_row_is_dropped_for_ticks_at_which_the_robot_held(mode: str, env: Contract) -> None:
+    player = ChunkExecutor(6, clock(mode=mode, neutral=[0, 0]), env)
+    executed = [played(player, latency_s) for latency_s in (0.2, 30.0, 0.0)]
+    assert executed[0][-6:] == [1, 2, 3, 4, 5, 6]
+    assert [*executed[1], *executed[2]][300:306] == [1, 2, 3, 4, 5, 6]
 
 
-def test_holding_repeats_the_last_action_and_zero_keeps_only_the_gripper() -> None:
-    holding, still = (ChunkExecutor(4, clock(meanwhile=how), RELATIVE) for how in ("hold", "zero"))
-    for player in (holding, still):
-        list(player.ticks(CHUNK, 0.0))
-    held = next(holding.ticks(CHUNK, 0.1))
-    stopped = next(still.ticks(CHUNK, 0.1))
-    assert (held.action.tolist(), held.waited, held.starved) == ([4, -1], True, True)
-    assert stopped.action.tolist() == [0, -1]
+@pytest.mark.parametrize("mode", ["open_loop", "async"])
+def test_a_robot_that_stands_keeps_its_grippers(mode: str) -> None:
+    player = ChunkExecutor(6, clock(mode=mode), RELATIVE)
+    list(player.ticks(CHUNK, 0.0))
+    held = next(player.ticks(CHUNK, 0.1))
+    assert (held.action.tolist(), held.waited, held.starved) == ([0, -1], True, True)
 
 
-@pytest.mark.parametrize("settings", [{}, {"meanwhile": "hold"}, {"meanwhile": "zero"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"mode": "open_loop"}], ids=str)
 @pytest.mark.parametrize("env", [RELATIVE, ABSOLUTE], ids=["relative", "absolute"])
 def test_a_further_task_begins_with_the_last_targets_and_without_motion(
     env: Contract, settings: dict[str, Any]
@@ -144,21 +143,26 @@ def test_an_answer_ends_the_episode_only_with_its_last_row(
 
 
 def test_a_single_action_is_executed_however_late_it_comes() -> None:
-    player = ChunkExecutor(None, clock(), RELATIVE)
+    player = ChunkExecutor(None, clock(mode="open_loop"), RELATIVE)
     for latency_s in (0.2, 0.0, 0.9):
         assert played(player, latency_s, CHUNK[:1]) == [0] * round(10 * latency_s) + [1]
+    late = ChunkExecutor(None, clock(neutral=[9, 9]), ABSOLUTE)
+    assert [played(late, latency_s, CHUNK[:1]) for latency_s in (0.2, 0.2)] == [[9, 9], [1, 1]]
 
 
 def test_an_answer_later_than_all_its_rows_is_good_for_its_last_one() -> None:
     player = ChunkExecutor(2, clock(), RELATIVE)
     played(player, 0.0)
     # The row stands for the pose 1 + 2 + 3, which is 6 behind the robot.
-    assert played(player, 0.3, CHUNK[:3]) == [3, 4, 5, -6]
+    assert played(player, 0.3, CHUNK[:3]) == [3, 4, 5]
+    assert played(player, 0.1)[0] == -6
 
 
 def test_a_started_tick_is_over_and_rounding_starts_none() -> None:
-    assert len(played(ChunkExecutor(None, clock(), RELATIVE), 1.1, CHUNK[:1])) == 11 + 1
-    assert len(played(ChunkExecutor(None, clock(), RELATIVE), 1.1001, CHUNK[:1])) == 12 + 1
+    for mode, further in (("open_loop", 1), ("async", 0)):
+        for latency_s, ticks in ((1.1, 11), (1.1001, 12)):
+            player = ChunkExecutor(None, clock(mode=mode), RELATIVE)
+            assert len(played(player, latency_s, CHUNK[:1])) == ticks + further
 
 
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=5), st.integers(1, 12))
@@ -184,7 +188,7 @@ def test_what_a_clock_lacks_is_named() -> None:
         ConfigError, match="expected 2 numbers, as the policy's actions have, got 3"
     ):
         played(ChunkExecutor(None, clock(neutral=[0, 0, 0]), sizeless), 0.1)
-    for execute in (None, 7):
+    for execute in (6, 7):
         with pytest.raises(ConfigError, match="all of which are executed before the next request"):
             played(ChunkExecutor(execute, clock(real_time_chunking=True), RELATIVE), 0.1)
     bare = Contract(action=RELATIVE.action)
@@ -196,8 +200,7 @@ def test_what_a_clock_lacks_is_named() -> None:
 # no value can contradict it.
 AGAINST_THE_CONTRACT: dict[str, tuple[dict[str, Any], Contract, str] | str] = {
     "latency": "a time of the policy; the environment's rate converts it to ticks",
-    "meanwhile": ({"meanwhile": "zero"}, ABSOLUTE, "zeros might command a motion"),
-    "align": "a choice of rows of the policy",
+    "mode": ({"mode": "open_loop"}, ABSOLUTE, "zeros might command a motion"),
     "real_time_chunking": "a choice of the policy",
     "neutral": ({"neutral": [0, 0, 0]}, ABSOLUTE, "2 numbers, as the environment's actions have"),
 }
@@ -227,7 +230,10 @@ def test_no_key_of_a_clock_contradicts_the_contract() -> None:
         {"latency": []},
         {"latency": [0.1, -1]},
         {"latency": [0.1, "measured"]},
-        {"meanwhile": "dance"},
+        {"mode": "dance"},
+        {"mode": "ensemble"},
+        {"real_time_chunking": True},
+        {"mode": "open_loop", "real_time_chunking": True},
         {"hz": 10.0},
     ],
 )
@@ -278,17 +284,18 @@ def outcome(result: EpisodeResult) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("execute", [None, 1, 3])
-@pytest.mark.parametrize("meanwhile", ["chunk", "hold", "zero"])
-def test_without_latency_it_is_the_synchronous_episode(meanwhile: Any, execute: int | None) -> None:
-    timing = ClockConfig(latency=0, meanwhile=meanwhile, neutral=[0])
-    in_real_time, synchronous = episode(3, timing, execute), episode(3, None, execute)
+@pytest.mark.parametrize("mode", ["open_loop", "async"])
+def test_without_latency_it_is_the_synchronous_episode(mode: Any, execute: int | None) -> None:
+    timing = ClockConfig(latency=0, mode=mode, neutral=[0])
+    in_real_time = episode(3, timing, execute)
+    synchronous = episode(3, None, 1 if mode == "async" and execute is None else execute)
     assert outcome(in_real_time) == outcome(synchronous)
     assert synchronous.time_share is None
     assert (in_real_time.ticks, in_real_time.starved) == (in_real_time.steps, 0)
 
 
 def test_latency_lowers_success_and_repeats_exactly() -> None:
-    timing = ClockConfig(latency=0.5, meanwhile="hold", neutral=[0])
+    timing = ClockConfig(latency=0.5, mode="open_loop", neutral=[0])
     synchronous, late, again = (
         [episode(seed, clock, 1) for seed in range(40)] for clock in (None, timing, timing)
     )
@@ -358,13 +365,12 @@ def observed(
     latency=st.floats(0, 2),
     rows=st.integers(1, 12),
     execute=st.none() | st.integers(1, 12),
-    meanwhile=st.sampled_from(["chunk", "hold", "zero"]),
-    align=st.booleans(),
+    mode=st.sampled_from(["open_loop", "async"]),
 )
 def test_ticks_in_time_are_those_that_an_observer_of_the_robot_sees(
-    latency: float, rows: int, execute: int | None, meanwhile: Any, align: bool
+    latency: float, rows: int, execute: int | None, mode: Any
 ) -> None:
-    timing = ClockConfig(latency=latency, meanwhile=meanwhile, align=align, neutral=[0])
+    timing = ClockConfig(latency=latency, mode=mode, neutral=[0])
     result, ages_ms = observed(rows, execute, timing)
     in_time = result.time_share
     assert in_time is not None
@@ -376,12 +382,12 @@ def test_ticks_in_time_of_known_episodes() -> None:
     # The first 2 ticks have no row. The next 4 rows are 200 to 500 ms old; while the policy
     # computes, the 2 remaining rows are 600 and 700 ms old. After that, each chunk gives 4 rows of
     # 200 to 500 ms, the last two of them while the policy computes.
-    timing = ClockConfig(latency=0.2, neutral=[0])
+    timing = ClockConfig(latency=0.2, mode="async", neutral=[0])
     result, _ = observed(6, 4, timing)
     assert result.time_share == TimeShare(60, 2, 400.0, 500.0, 700.0)
 
     # Every second tick waits for an answer.
-    result, _ = observed(1, None, ClockConfig(latency=0.1, neutral=[0]))
+    result, _ = observed(1, None, ClockConfig(latency=0.1, mode="open_loop", neutral=[0]))
     assert result.time_share == TimeShare(60, 30, 100.0, 100.0, 100.0)
     assert result.time_share.share == 0.5
 
@@ -407,13 +413,12 @@ def test_measured_latency_is_what_the_policy_took() -> None:
     latency=st.floats(0, 5),
     rows=st.integers(1, 5),
     execute=st.none() | st.integers(1, 6),
-    meanwhile=st.sampled_from(["chunk", "hold", "zero"]),
-    align=st.booleans(),
+    mode=st.sampled_from(["open_loop", "async"]),
 )
 def test_an_episode_never_has_more_steps_than_its_env_allows(
-    latency: float, rows: int, execute: int | None, meanwhile: Any, align: bool
+    latency: float, rows: int, execute: int | None, mode: Any
 ) -> None:
-    timing = ClockConfig(latency=latency, meanwhile=meanwhile, align=align, neutral=[0])
+    timing = ClockConfig(latency=latency, mode=mode, neutral=[0])
     result = run_episode(
         Line(), ToZero(chunk=rows), EpisodeKey("line", 0, 1, "0"), execute=execute, clock=timing
     )

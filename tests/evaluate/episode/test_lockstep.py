@@ -193,7 +193,7 @@ def test_each_episode_needs_a_session_and_an_environment() -> None:
 
 def test_each_episode_has_a_clock_of_its_own() -> None:
     wanted = keys("line", 4)
-    clock = ClockConfig(latency=0.2, neutral=[0.0], real_time_chunking=True)
+    clock = ClockConfig(latency=0.2, mode="async", neutral=[0.0], real_time_chunking=True)
     expected = [run_episode(Line(), ToZero(chunk=3), key, execute=2, clock=clock) for key in wanted]
     with SequentialBatch([Line() for _ in wanted]) as env:
         results = together(env, ToZero(chunk=3), wanted, execute=2, clock=clock)

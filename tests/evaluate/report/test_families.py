@@ -131,7 +131,7 @@ def _solved(case: EvalCase, seed: int) -> int | None:
 
 
 def _suites(*, clocks: tuple[str, ...] = ("waiting", "live")) -> list[dict[str, Any]]:
-    clock = {"latency": 0.1, "meanwhile": "hold"}
+    clock = {"latency": 0.1, "mode": "async"}
     waiting = {"name": "waiting", "envs": [LINE], "episodes": WAITING}
     live = {"name": "live", "envs": [LINE], "episodes": LIVE, "clock": clock}
     return [{"waiting": waiting, "live": live}[name] for name in clocks]

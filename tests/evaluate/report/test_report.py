@@ -366,7 +366,7 @@ def test_real_time_and_synchronous_scores_are_compared_apart_and_their_gap_is_sh
             "name": "live",
             "envs": [LINE],
             "episodes": 4,
-            "clock": {"latency": 0.1, "meanwhile": "hold"},
+            "clock": {"latency": 0.1, "mode": "async"},
         },
         {"name": "waiting", "envs": [LINE], "episodes": 4},
     ]

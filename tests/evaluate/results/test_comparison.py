@@ -164,7 +164,7 @@ def test_the_gap_to_the_synchronous_score_pairs_suites_that_differ_in_their_cloc
     suites: list[dict[str, Any]] = [
         {"name": name, "envs": [LINE], "episodes": 4} for name in ("live", "waiting")
     ]
-    suites[0]["clock"] = {"latency": 0.1, "meanwhile": "hold"}
+    suites[0]["clock"] = {"latency": 0.1, "mode": "async"}
     config = runs(tmp_path, steps=[], suites=suites)
     gaps = clock_gaps(
         record(config, lambda case, seed: 5 if case.suite.name == "waiting" or seed == 0 else None)

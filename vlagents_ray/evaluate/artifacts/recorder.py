@@ -271,6 +271,8 @@ class TrajectoryRecorder(EpisodeObserver):
         """Record the version of weights in an answer; it applies after `ticks_waited` further
         actions.
         """
+        if self._next[0] == 0:  # no action was executed since the last answer applied
+            self._version = self._next[1]
         version = version_of(act)
         self._next = ticks_waited, NO_VERSION if version is None else version
 

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vlagents_ray.chunking.choice import choose_for
 from vlagents_ray.chunking.timeliness import Timeliness
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
@@ -221,7 +222,8 @@ def run_episodes(
     Args:
         sessions: The session of each episode.
         keys: Environment, number and seed of each episode.
-        execute: The number of rows of each action chunk that are executed, open loop; None: all.
+        execute: The number of rows of each action chunk that are executed, open loop; None: all,
+            or as the mode of the clock requires.
         clock: The real-time mode, in which simulated time passes while the policy computes (see
             `latency`); None: the environments wait for the policy.
         reset_options: The options of each reset of an environment.
@@ -265,6 +267,11 @@ def run_episodes(
             )
             instructions.append(failures.checked_instruction(text, "reset"))
     reset_ms = 1e3 * (perf_counter() - start)
+
+    if clock is not None:
+        # The mode and the settings that a robot with this policy has.
+        choice = choose_for(agent, **clock.choice(execute, contract.control_hz))
+        clock, execute = clock.chosen(choice), choice.settings.execute
 
     def new_executor(last: np.ndarray | None) -> ChunkExecutor:
         return ChunkExecutor(execute, clock, contract, last)

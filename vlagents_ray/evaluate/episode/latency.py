@@ -1,10 +1,10 @@
 """Real-time evaluation: the environment's clock runs while the policy computes.
 
 The clock is simulated, so the speed of the machine does not matter. An answer that took L seconds
-arrives ceil(L * hz) ticks after its observation. The environment executes these ticks with the
-actions that `ClockConfig.meanwhile` selects. Then it executes the answer's rows, beginning with the
-same row as the chunk player (`vlagents_ray.chunking.buffer.ChunkBuffer`). A synchronous evaluation
-is the case L = 0.
+arrives ceil(L * hz) ticks after its observation. During these ticks, the robot stands
+("open_loop"), or executes the rest of the last chunk ("async"). Then it executes the answer's rows,
+beginning with the same row as the chunk player (`vlagents_ray.chunking.buffer.ChunkBuffer`). A
+synchronous evaluation is the case L = 0.
 """
 
 from __future__ import annotations
@@ -52,8 +52,10 @@ class ChunkExecutor:
         """Begin an episode, or a further task of it.
 
         Args:
-            execute: Number of rows of a chunk to execute before the next request; None: all.
-            clock: The real-time mode; None: the environment waits for the policy.
+            execute: Number of rows of a chunk to execute before the next request; None: all,
+                or in "async" one, as in the chunk player.
+            clock: The real-time mode, with a mode other than "auto"; None: the environment waits
+                for the policy.
             env: The contract of the environment.
             last: The last action of the task before, (D,), whose targets are kept.
 
@@ -63,6 +65,8 @@ class ChunkExecutor:
         """
         self._execute = execute
         self._real_time = clock is not None
+        if clock is not None and clock.mode == "async":
+            self._execute = execute or 1
         self._clock = _SYNCHRONOUS if clock is None else clock
         self._hz = env.control_hz or 0.0
         if self._real_time and not self._hz:
@@ -88,7 +92,6 @@ class ChunkExecutor:
         self._plan = ChunkBuffer(action=env.action)
         self._tick = 0  # the number of the next tick in real-time mode
         self._last = last  # the last action, (D,)
-        self._answered = False  # whether a row of an answer was executed
         self._delay = DelayEstimate()
 
     def latency_s(self, measured_s: float) -> float | None:
@@ -147,12 +150,10 @@ class ChunkExecutor:
         # The last row is always executed; otherwise no action of a policy that is slower than its
         # chunks would ever be executed.
         latest_start = self._plan.executed - len(rows) + 1
-        if self._clock.align:
-            start = max(executed_at_request, latest_start)
-        else:
-            start, origin = self._plan.executed, self._plan.origin()
+        start = max(executed_at_request, latest_start)
         self._plan.replace(rows, start, observed, origin)
-        self._answered = True
+        if self._clock.mode == "async" and execute is not None and ticks_waited >= execute:
+            return  # The next request is due at this tick, as in the chunk player.
         end = len(rows) if execute is None else min(execute, len(rows))
         is_last = False
         while not is_last:
@@ -162,15 +163,10 @@ class ChunkExecutor:
 
     def _waiting(self, ticks: int, dim: int) -> Iterator[Tick]:
         for _ in range(ticks):
-            step = self._plan.next if self._clock.meanwhile == "chunk" else None
+            step = self._plan.next if self._clock.mode == "async" else None
             if step is None:
                 action = self._held(dim)
-                # A repeated relative action moves the robot further, so that the plan advances.
-                repeats = self._clock.meanwhile == "hold" and self._answered
-                if repeats and Columns.from_spec(self._spec, dim).relative:
-                    self._plan.advance(action)
-                else:
-                    self._plan.move(action)
+                self._plan.move(action)
                 yield self._executed(action, None, waited=True)
             else:
                 self._plan.advance(step.action)
@@ -191,27 +187,18 @@ class ChunkExecutor:
         return Tick(action, waited, observed is None, age_ms)
 
     def _held(self, dim: int) -> np.ndarray:
-        """Return the action of a tick for which no row remains, (D,)."""
-        columns = Columns.from_spec(self._spec, dim)
-        configured = None
-        if self._clock.neutral is not None:
-            configured = np.asarray(self._clock.neutral, np.float32)
-            if configured.shape != (dim,):
-                raise ConfigError(
-                    f"clock.neutral: expected {dim} numbers, as the policy's actions have, got "
-                    f"{len(configured)}"
-                )
-
-        last = self._last
-        if last is None:
-            return self._first_still(dim) if configured is None else configured
-        if self._clock.meanwhile == "hold" and self._answered:
-            return last
-        if self._clock.meanwhile == "zero" and configured is not None:
-            grippers = list(columns.grippers)
-            configured[grippers] = last[grippers]
-            return configured
-        return columns.still(last)
+        """Return the action of a tick at which the robot stands, (D,)."""
+        if self._last is not None:
+            return Columns.from_spec(self._spec, dim).still(self._last)
+        if self._clock.neutral is None:
+            return self._first_still(dim)
+        neutral = np.asarray(self._clock.neutral, np.float32)
+        if neutral.shape != (dim,):
+            raise ConfigError(
+                f"clock.neutral: expected {dim} numbers, as the policy's actions have, got "
+                f"{len(neutral)}"
+            )
+        return neutral
 
     def _first_still(self, dim: int) -> np.ndarray:
         """Return the action before the first answer, (D,): no motion, with open grippers, as

@@ -8,7 +8,7 @@ import hashlib
 import itertools
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
@@ -33,6 +33,7 @@ from vlagents_ray.bounds import (
     MOST_STEPS_NAMED,
     MOST_WORKERS,
 )
+from vlagents_ray.chunking.choice import Choice, ChosenMode
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 
@@ -128,7 +129,8 @@ class PolicyConfig(_PlanModel):
     )
     execute: Rows | None = Field(
         default=None,
-        description="Number of rows of each action chunk that are executed. null: all.",
+        description="Number of rows of each action chunk that are executed before the next "
+        "request. null: all; in real time and on a robot, as the mode requires.",
     )
     codec: Literal["exact", "raw", "lossless", "jpeg"] = Field(
         default="exact",
@@ -223,27 +225,50 @@ class ClockConfig(_PlanModel):
         "which an episode is reproducible: a number, or a list, whose numbers the answers of an "
         "episode have in turn, such as a recorded series.",
     )
-    meanwhile: Literal["chunk", "hold", "zero"] = Field(
-        default="chunk",
-        description="Action until the answer arrives. `chunk`: the remaining rows of the last "
-        "chunk, then a stop of the robot. `hold`: the last action again. `zero`: no "
-        "motion, and the gripper as commanded.",
-    )
-    align: bool = Field(
-        default=True,
-        description="Drop the rows for ticks at which other actions were executed before the "
-        "answer arrived.",
+    mode: Literal["auto", "open_loop", "async"] = Field(
+        default="auto",
+        description="Mode in which chunks are executed. `open_loop`: the robot stands until the "
+        "answer arrives. `async`: it executes the remaining rows of the last chunk, and stands if "
+        "there are none. `auto`: chosen for the policy, as for a robot.",
     )
     real_time_chunking: bool = Field(
         default=False,
         description="Send the policy the remaining rows of the last chunk, and the number of "
-        "ticks of the delay.",
+        "ticks of the delay. Requires `mode: async`.",
     )
     neutral: list[FiniteFloat] | None = Field(
         default=None,
-        description="Action before the first answer, and of `zero`, which keeps the gripper. null: "
-        "no motion, with the gripper open at first.",
+        description="Action before the first answer. null: no motion, with the gripper open at "
+        "first.",
     )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.real_time_chunking and self.mode != "async":
+            raise ValueError(
+                f"real_time_chunking: expected mode: async with it, got {self.mode}; set the mode"
+            )
+        return self
+
+    def choice(self, execute: int | None, hz: float | None) -> dict[str, Any]:
+        """Return the arguments with which `vlagents_ray.chunking.choice.choose` chooses the mode.
+
+        Args:
+            execute: The `execute` of the policy's settings.
+            hz: The rate of the environment, 1/s.
+        """
+        return {
+            "mode": self.mode,
+            "hz": hz,
+            "delay_s": self.latency if isinstance(self.latency, (int, float)) else None,
+            "execute": execute,
+            "real_time_chunking": self.real_time_chunking,
+        }
+
+    def chosen(self, choice: Choice) -> ClockConfig:
+        """Return this clock with the chosen mode in place of `auto`."""
+        chunking = choice.settings.real_time_chunking
+        return self.model_copy(update={"mode": choice.mode, "real_time_chunking": chunking})
 
 
 class StopConfig(_PlanModel):
@@ -416,9 +441,9 @@ class RobotConfig(_PlanModel):
         default=10.0,
         description="Control rate.",
     )
-    mode: Literal["open_loop", "ensemble", "async"] = Field(
-        default="async",
-        description="Mode of the chunk player.",
+    mode: ChosenMode = Field(
+        default="auto",
+        description="Mode of the chunk player. `auto`: chosen for the policy.",
     )
     deadline_s: Annotated[float, Field(ge=0, le=3600)] | None = Field(
         default=None,

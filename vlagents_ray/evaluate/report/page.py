@@ -45,6 +45,7 @@ from vlagents_ray.evaluate.report.success import (
 )
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.comparison import clock_gaps
+from vlagents_ray.evaluate.results.modes import modes
 from vlagents_ray.evaluate.results.reader import CaseResults, Results, Run, by_timing, rate_of
 from vlagents_ray.evaluate.results.statistics import median
 from vlagents_ray.evaluate.results.summary import Summary, pushed_of, reported, summarize
@@ -266,6 +267,7 @@ class Latency:
     # (policy id, task, figures) for each case; the figures are None if the environment waits for
     # the policy
     in_time: list[tuple[str, str, TimeShare | None]]
+    modes: list[str]  # a line for each mode in real time or on a robot, see `modes`
 
 
 def latency(summary: Summary) -> Latency | None:
@@ -304,7 +306,9 @@ def latency(summary: Summary) -> Latency | None:
         (group.policy_id, f"{group.suite} {group.env}".strip(), group.time_share)
         for group in summary.cases
     ]
-    return Latency(chart, stages, rows, summary.transports, len(timed), in_time)
+    return Latency(
+        chart, stages, rows, summary.transports, len(timed), in_time, modes(summary.results)
+    )
 
 
 _SETTINGS = ("env_options", "reset_options", "clock")

@@ -22,6 +22,7 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
+from vlagents_ray.evaluate.results.modes import modes
 from vlagents_ray.evaluate.results.reader import CaseResults
 from vlagents_ray.evaluate.results.statistics import Rate
 from vlagents_ray.evaluate.results.summary import (
@@ -294,7 +295,7 @@ def print_summary(console: Console, summary: Summary) -> None:
         lines.append(f"{kind}: {change}")
     lines += _intervals(summary)
     lines += [*_pushed_weights(summary), *_early_stops(summary), *_clock_gaps(summary)]
-    lines += _times(summary)
+    lines += [*modes(summary.results), *_times(summary)]
     if summary.state == RUNNING:
         lines.append("still running")
     elif summary.state != "complete":

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.chunking.choice import choose_for
 from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import Command, CommandInbox
@@ -29,7 +30,7 @@ from vlagents_ray.evaluate.episode.episode import EpisodeStats, transport_of
 from vlagents_ray.evaluate.episode.failures import env_side, policy_side
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.evaluate.plan.config import RobotConfig, canonical
+from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.robot.operator import Operator
 from vlagents_ray.evaluate.workers.rollout import AgentFactory
@@ -44,7 +45,6 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.wrapper import RobotWrapper
 
 _STOPPED = "stopped by the operator"
-_WAIT_S = 1.0  # deadline of a tick, s, in the modes that wait for an answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,12 +256,7 @@ def play(
     """
     case = trial.job.case
     settings, task = case.on_robot
-    deadline_s = _deadline_s(settings)
     stats = robot.stats = EpisodeStats(trial.job.key, instructions=[task.instruction])
-    hangs_s = max(0.2, 5 / settings.hz) + deadline_s
-    watchdog = robot_watchdog(
-        robot, lambda _: robot.stop(), {"server": settings.silent_s, "loop": hangs_s}
-    )
     stopped = False
 
     def until() -> bool:
@@ -272,6 +267,10 @@ def play(
     with contextlib.ExitStack() as stack:
         stack.callback(setattr, robot, "stats", None)
         agent, player = stack.enter_context(_player(case, factory, stats, robot, operator))
+        hangs_s = max(0.2, 5 / settings.hz) + (player.settings.deadline_s or 0.0)
+        watchdog = robot_watchdog(
+            robot, lambda _: robot.stop(), {"server": settings.silent_s, "loop": hangs_s}
+        )
         recorder = None
         if recording is not None:
             recorder = stack.enter_context(Recorder(recording, settings.hz))
@@ -379,10 +378,12 @@ def _player(
         unplayed.callback(agent.close)
         agent.initialize()
 
-        player_settings = PlayerSettings(
+        choice = choose_for(
+            agent,
             mode=settings.mode,
+            hz=settings.hz,
             execute=case.policy.execute,
-            deadline_s=_deadline_s(settings),
+            deadline_s=settings.deadline_s,
             max_age_s=settings.max_age_s,
             safe=settings.safe,
         )
@@ -394,14 +395,8 @@ def _player(
             hz=settings.hz,
             soft_start_s=0.0,  # all trials of all policies then have the same limits
         )
-        player = _CountingPlayer(agent, stats, robot, operator, player_settings, check=guard)
+        player = _CountingPlayer(agent, stats, robot, operator, choice.settings, check=guard)
         unplayed.pop_all()  # closing the player closes the agent
 
     with player:
         yield agent, player
-
-
-def _deadline_s(settings: RobotConfig) -> float:
-    if settings.deadline_s is not None:
-        return settings.deadline_s
-    return 0.0 if settings.mode == "async" else _WAIT_S

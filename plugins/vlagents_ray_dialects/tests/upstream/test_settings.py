@@ -15,6 +15,8 @@ from eval_fakes import wait_for
 from upstream_servers import pack_openpi, unpack_openpi, upstream
 from websockets.sync.server import serve
 
+from vlagents_ray.chunking.choice import choose, choose_for
+from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import (
     ConfigError,
     ContractMismatch,
@@ -62,6 +64,39 @@ def test_the_deployment_states_what_the_mapping_does_not_say() -> None:
     assert agent.contract.action.gripper_open == 0  # from the mapping
     assert agent.contract.chunk == 10
     assert set(agent.contract.cameras or {}) == {"front", "wrist"}
+
+
+# No protocol says whether actions are relative, except where the settings declare it.
+PROTOCOLS: dict[str, dict[str, Any]] = {
+    "openpi": OPENPI,
+    "openpi, a preset": OPENPI | {"mapping": "openpi-libero"},
+    "roboarena": {"protocol": "roboarena", "urls": ["ws://127.0.0.1:9"]},
+    "openvla": {"protocol": "openvla", "urls": ["http://127.0.0.1:9"]},
+    "vla_eval": {"protocol": "vla_eval", "urls": ["ws://127.0.0.1:9"]},
+    "gr00t": {
+        "protocol": "gr00t",
+        "urls": ["tcp://127.0.0.1:9"],
+        "mapping": {"preset": "gr00t", "action": {"arm": {"stop": 7}}},
+    },
+}
+
+
+@pytest.mark.parametrize("delta", [True, False])
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_foreign_policy_gets_the_mode_of_its_declared_contract(
+    protocol: str, delta: bool
+) -> None:
+    contract = {"action": {"dim": 7}, "chunk": 10}
+    undeclared = Upstream.from_config(PROTOCOLS[protocol] | {"contract": contract})
+    choice = choose_for(undeclared, hz=10.0, delay_s=0.3)
+    assert (choice.mode, choice.settings.execute) == ("open_loop", 5)
+    assert "does not declare" in choice.line
+
+    contract["action"] = {"dim": 7, "delta": delta}
+    declared = Upstream.from_config(PROTOCOLS[protocol] | {"contract": contract})
+    ours = choose(Contract(action=ActionSpec(dim=7, delta=delta), chunk=10), hz=10.0, delay_s=0.3)
+    assert ours.mode == "async"
+    assert choose_for(declared, hz=10.0, delay_s=0.3) == ours
 
 
 @pytest.fixture(scope="module")

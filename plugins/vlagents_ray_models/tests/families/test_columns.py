@@ -58,7 +58,7 @@ def test_a_checkpoint_with_mixed_groups_keeps_each_target(
     values = st.lists(st.floats(-2.0, 2.0, width=32), min_size=dim, max_size=dim)
     last = np.array(data.draw(values), np.float32)
     commands = [SafeAction("auto", spec)(Obs(), last)]
-    clock = ClockConfig(latency=0.2)
+    clock = ClockConfig(latency=0.2, mode="async")
     executor = ChunkExecutor(None, clock, Contract(action=spec, control_hz=10.0), last)
     commands.append(next(executor.ticks(last[np.newaxis], 0.2)).action)
 
