@@ -131,6 +131,15 @@ class RecordedDataset:
         return [f"{ACTION}_{i}" for i in range(dim)]
 
     @property
+    def rows(self) -> int | None:
+        """The number of rows of each forward pass of the recorded policy; None if it is unknown, or
+        if the bits of its actions may depend on the batch.
+        """
+        passes = (self.info.get(TRACE) or {}).get("passes") or {}
+        rows = passes.get("rows")
+        return rows if isinstance(rows, int) else None
+
+    @property
     def fps(self) -> float:
         """The rate of the frames, Hz."""
         return float(self.info["fps"])

@@ -15,8 +15,10 @@ from eval_fakes import LINE, PYTHONPATH
 from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
+from vlagents_ray.cli.policies import with_full_passes
 from vlagents_ray.evaluate import Results
-from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
+from vlagents_ray.serve.config.deployment import BatchArgs
+from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, Deployment
 
 POLICY = """
 import os
@@ -110,6 +112,56 @@ def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
     assert len({tuple(one) for one in actions.values()}) == 3
     assert {one.result.checkpoint for one in cases["swept@1"].episodes} == {"w-1.txt"}
     assert {one.result.transport for case in cases.values() for one in case.episodes} == {"local"}
+
+
+@pytest.mark.slow
+@pytest.mark.torch
+def test_an_episode_beside_others_is_replayed_to_the_bit(folder: Path) -> None:
+    pytest.importorskip("torch")
+    checkpoint = str(Path(__file__).parents[2] / "examples/reference/checkpoint")
+    policy = {
+        "source": "reference",
+        "config": {"checkpoint": checkpoint, "embodiment": "tabletop", "execute": 4},
+    }
+    options = {"width": 64, "height": 64, "cameras": ["front", "wrist"], "max_steps": 12}
+    suite = {"envs": ["tabletop"], "episodes": 5, "num_envs": 3, "env_options": options}
+    plan = {"policies": [policy], "suites": [suite], "video": "none", "record": "all"}
+    (folder / "runs.yaml").write_text(yaml.safe_dump(plan))
+    command = [*POISON, "eval", "runs.yaml", "--workers", "0"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+    results = Results.load(folder / "runs" / "runs")
+    # Three environments act together, and a pass has the next power of two.
+    assert results.policies["reference"]["passes"] == {"invariant": True, "rows": 4}
+    for number in (1, 4):
+        command = [*POISON, "replay", "runs/runs", f"tabletop#{number}"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "actions byte for byte, and their outcomes" in done.stdout
+
+
+def _batch(sessions: int, rows: int | None = None, **batch: object) -> dict[str, object]:
+    args = {"batch": batch} if batch else {}
+    changed = with_full_passes(
+        Deployment.model_validate(deployment(**args)), sessions, rows
+    ).applications[0]
+    described = BatchArgs.model_validate(changed.args.get("batch", {}))
+    return {"max_size": described.max_size, "invariant": described.invariant}
+
+
+def test_an_evaluation_pads_its_full_batches() -> None:
+    assert _batch(1) == {"max_size": 16, "invariant": False}
+    assert _batch(5) == {"max_size": 8, "invariant": "auto"}
+    assert _batch(100) == {"max_size": 16, "invariant": "auto"}
+    assert _batch(100, max_size=2) == {"max_size": 2, "invariant": "auto"}
+    # What the file says of it is kept.
+    assert _batch(5, invariant=False) == {"max_size": 16, "invariant": False}
+    assert _batch(5, invariant=True) == {"max_size": 16, "invariant": True}
+    assert _batch(5, sizes=[4, 8]) == {"max_size": 8, "invariant": False}
+    # A replay has the recorded number of rows.
+    assert _batch(1, 8) == {"max_size": 8, "invariant": True}
+    assert _batch(1, 8, sizes=[2]) == {"max_size": 8, "invariant": True}
 
 
 REFUSED: Mapping[str, tuple[dict[str, object], list[str], str]] = {

@@ -96,14 +96,20 @@ def seen(i: int, side: int = WIDTH) -> Obs:
 
 
 @contextmanager
-def recorded(folder: Path, agent: Agent | None = None, **settings: Any) -> Iterator[Recorded]:
+def recorded(
+    folder: Path, agent: Agent | Engine | None = None, **settings: Any
+) -> Iterator[Recorded]:
     """Run a replica that records with these settings of `parts: {record: ...}`."""
-    engine = Engine(agent or Brightness())
+    engine = agent if isinstance(agent, Engine) else Engine(agent or Brightness())
     engine.start()
 
     def metadata() -> dict[str, Any]:
         assert engine.contract is not None
-        return {"policy": "brightness", "contract": engine.contract.to_json()}
+        return {
+            "policy": "brightness",
+            "contract": engine.contract.to_json(),
+            "passes": engine.model.passes,
+        }
 
     context = PartContext(engine, "SERVE_REPLICA::app#Policy#a1", "here", metadata)
     part = Recording(RecordConfig(folder=str(folder), **settings), context)

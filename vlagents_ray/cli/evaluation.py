@@ -190,15 +190,21 @@ def run_evaluation(
     require_results(running.plan.cases, summary)
 
 
-def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:
+def play_one(
+    config: EvalConfig, address: str | None, only: tuple[int, int], *, rows: int | None = None
+) -> Summary:
     """Serve the policy, unless it is at a URL, and run one of its episodes.
 
     Args:
         config: The evaluation of one policy in one environment.
         address: The Ray cluster, see `served`.
         only: The number and the seed of the episode, as in `evaluate`.
+        rows: The number of rows of each forward pass, as in `served`.
     """
-    with served(config, address) as running, shown_progress(running.plan, None) as progress:
+    with (
+        served(config, address, rows=rows) as running,
+        shown_progress(running.plan, None) as progress,
+    ):
         return evaluate_plan(
             running.plan,
             agent_factory=running.agents,

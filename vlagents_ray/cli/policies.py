@@ -42,6 +42,7 @@ from vlagents_ray.serve.launch.deployment_file import (
     Deployment,
     declared_contract,
     only_application,
+    our_apps,
     own_settings,
     read_deployment,
     together,
@@ -67,7 +68,11 @@ class Served:
 
 @contextlib.contextmanager
 def served(
-    config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False
+    config: EvalConfig,
+    address: str | None = None,
+    *,
+    replica_per_gpu: bool = False,
+    rows: int | None = None,
 ) -> Iterator[Served]:
     """Resolve an evaluation and, within the context, serve its policies that are not at a URL, or
     run them in this process.
@@ -76,6 +81,8 @@ def served(
         config: The evaluation.
         address: A running Ray cluster; None starts one on this machine if Ray is needed.
         replica_per_gpu: Whether each policy has a replica on each GPU of the cluster.
+        rows: The number of rows of each forward pass, with `batch.invariant`; None: as the
+            deployments say, see `with_full_passes`.
 
     Yields:
         The plan with its policies.
@@ -91,6 +98,10 @@ def served(
             _enter_ray(stack, address)
 
         ready, deployments = resolve_policies(config)
+        if config.real_robot is None:
+            sessions = _most_sessions(config, on_ray=on_ray)
+            for name, deployment in deployments.items():
+                deployments[name] = with_full_passes(deployment, sessions, rows)
         local = None if on_ray else _local_policies(deployments, config.workers)
         if not on_ray and local is None:
             _require_simulators(config, address)
@@ -123,6 +134,41 @@ def served(
                 _served_on_ray(plan, deployments, address, replica_per_gpu=replica_per_gpu)
             )
         yield Served(plan, agents, swaps)
+
+
+def _most_sessions(config: EvalConfig, *, on_ray: bool) -> int:
+    """Return the largest number of episodes that act at the same time; 1 if no worker steps several
+    environments.
+    """
+    environments = max(case.suite.num_envs for case in plan_cases(config))
+    workers = config.workers or 1 if on_ray else 1
+    return environments * workers if environments > 1 else 1
+
+
+def with_full_passes(deployment: Deployment, sessions: int, rows: int | None = None) -> Deployment:
+    """Return the deployment of an evaluation, in which no bit of an action depends on its batch.
+
+    Args:
+        deployment: The deployment of a policy.
+        sessions: The number of episodes that act at the same time. The passes have as many rows,
+            rounded up to a power of two, and at most `batch.max_size`. With 1, the deployment is
+            not changed, nor if its file sets `batch.invariant` or `batch.sizes`.
+        rows: The number of rows of each pass of a recorded evaluation, which applies in any case.
+    """
+    changed = deployment.model_copy(deep=True)
+    for app in our_apps(changed):
+        batch = ServerArgs(**app.args).batch
+        if rows is not None:
+            app.args["batch"] = {
+                "patience": batch.patience,
+                "max_size": rows,
+                "invariant": True,
+            }
+        elif sessions > 1 and not batch.model_fields_set & {"invariant", "sizes"}:
+            size = min(batch.max_size, 2 ** (sessions - 1).bit_length())
+            settings = app.args.get("batch") or {}
+            app.args["batch"] = {**settings, "max_size": size, "invariant": "auto"}
+    return changed
 
 
 def planned_workers(

@@ -242,7 +242,8 @@ def replay_command(
             )
         replay_folder = out_dir or fresh(folder / "replays" / "replay")
         config = recorded.config(replay_folder, policy=other_policy)
-        summary = play_one(config, address, recorded.number_and_seed)
+        rows = recorded.rows if policy is None else None
+        summary = play_one(config, address, recorded.number_and_seed, rows=rows)
 
         differences = compare(recorded, summary.results)
         rounding = actions_difference(recorded, summary.results)

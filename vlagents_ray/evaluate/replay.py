@@ -52,6 +52,15 @@ class Recorded:
         """(number, seed) of the episode, for `evaluate(..., only=...)`."""
         return self.episode.result.key.episode, self.episode.result.key.seed
 
+    @property
+    def rows(self) -> int | None:
+        """The number of rows of the policy's forward passes; None if the bits of its actions may
+        depend on the batch.
+        """
+        metadata = self.results.policies.get(self.case.policy) or {}
+        rows: int | None = (metadata.get("passes") or {}).get("rows")
+        return rows
+
     def config(self, out: Path, *, policy: dict[str, Any] | None = None) -> EvalConfig:
         """Return the settings for an evaluation of only this episode's case, with video and
         trajectory. All other settings are those of the episode's run.

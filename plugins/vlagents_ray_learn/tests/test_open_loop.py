@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -25,10 +28,13 @@ from vlagents_ray.images import jpeg_png
 from vlagents_ray.images.mp4 import Mp4
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.random import Random
+from vlagents_ray.protocol.messages import Request
 from vlagents_ray.recorded_dataset import Names, RecordedDataset
 from vlagents_ray.robot.record import Recorder
+from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.local_agent import LocalAgent
+from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
+from vlagents_ray.serve.local_agent import LocalAgent, build_engine
 from vlagents_ray_learn.open_loop import comparison
 from vlagents_ray_learn.open_loop.command import parse_episodes
 from vlagents_ray_learn.open_loop.comparison import (
@@ -39,6 +45,9 @@ from vlagents_ray_learn.open_loop.comparison import (
     open_datasets,
 )
 from vlagents_ray_live import episodes
+
+ROOT = Path(__file__).parents[3]
+_ROBOTS, _TICKS = 6, 8
 
 
 class Follow(Agent):
@@ -262,6 +271,64 @@ def test_the_command_prints_and_writes_the_errors(tmp_path: Path) -> None:
     assert "mean absolute error 5.25" in done.output
     document = json.loads((out / "open_loop.json").read_text())
     assert document["by_joint"][0]["mae"] == pytest.approx(np.mean([1, 2, 3, 4, 5, 6]))
+
+
+@pytest.mark.torch
+def test_each_answer_of_robots_in_batches_is_computed_again_alone_in_another_process(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("torch")
+    args: dict[str, Any] = {
+        "policy": "reference",
+        "config": {
+            "checkpoint": str(ROOT / "examples/reference/checkpoint"),
+            "embodiment": "tabletop",
+        },
+        "batch": {"max_size": 4, "invariant": True},
+    }
+    engine = build_engine(ServerArgs(**args), args["config"])
+    sizes: list[int] = []
+
+    def play(server: Any, number: int) -> None:
+        robot = server.robot()
+        robot.ask(Request("reset", table(number), "lift the red puck", {"seed": number}))
+        for tick in range(_TICKS):
+            reply = robot.ask(Request("act", table(100 * number + tick)))
+            sizes.append(reply.timing["batch_size"])
+
+    with (
+        recorded(tmp_path / "traces", engine) as server,
+        ThreadPoolExecutor(_ROBOTS) as threads,
+    ):
+        list(threads.map(partial(play, server), range(_ROBOTS)))
+    assert max(sizes) > 1
+
+    # The file says nothing of batches: the number of rows is that of the recording.
+    del args["batch"]
+    (tmp_path / "policy.yaml").write_text(
+        json.dumps({"applications": [{"import_path": IMPORT_PATH, "args": args}]})
+    )
+    command = ["open-loop", "traces", "--policy", "policy.yaml", "--out", "report"]
+    done = subprocess.run(
+        [sys.executable, "-m", "vlagents_ray", *command],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    frames = _ROBOTS * _TICKS
+    assert f"equal to the bit: {frames} of {frames} answers" in done.stdout
+    document = json.loads((tmp_path / "report" / "open_loop.json").read_text())
+    assert (document["equal"], document["max"]) == (frames, 0.0)
+
+
+def table(seed: int) -> Obs:
+    """Return a random observation of the tabletop."""
+    rng = np.random.default_rng(seed)
+    images = {name: rng.integers(0, 256, (64, 64, 3), np.uint8) for name in ("front", "wrist")}
+    pose = rng.normal(0, 0.1, 6).astype(np.float32)
+    return Obs(images, 0.5, {"xyzrpy": pose})
 
 
 def policy_file(folder: Path) -> str:

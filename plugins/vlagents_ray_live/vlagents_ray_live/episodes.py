@@ -34,7 +34,18 @@ _FREE_BYTES = 1e9  # the space that the recording leaves free on its disk, bytes
 KEPT = "the saved episodes are kept; restart the server to record again"  # after a disk error
 _CHECK_S = 10.0  # the interval of the checks of the folder's size
 # The keys of the metadata that a trace contains.
-_TRACE_KEYS = ("policy", "checkpoint", "weights", "policy_version", "contract", "version", "code")
+_TRACE_KEYS = (
+    "policy",
+    "checkpoint",
+    "weights",
+    "policy_version",
+    "contract",
+    "version",
+    "code",
+    "program",
+    "devices",
+    "passes",
+)
 
 
 class RecordingEnded(Exception):

@@ -92,6 +92,7 @@ def open_loop_command(
             candidate,
             compare,
             open_datasets,
+            recorded_rows,
             write_result,
         )
 
@@ -110,7 +111,7 @@ def open_loop_command(
         datasets = open_datasets(folder)
         result_folder = out_dir or fresh(Path("runs/open_loop"))
         require_folder(result_folder)
-        with candidate(source, overrides) as open_session:
+        with candidate(source, overrides, recorded_rows(datasets)) as open_session:
             result = compare(datasets, open_session, plan)
 
         table = result.to_json()
@@ -120,6 +121,8 @@ def open_loop_command(
             f"mean absolute error {table['mae']:.4g}, root mean square {table['rmse']:.4g}, "
             f"largest {table['max']:.4g}"
         )
+        if table["equal"] is not None:
+            out.print(f"equal to the bit: {table['equal']} of {table['frames']} answers")
         for joint in table["by_joint"]:
             out.print(
                 f"  {joint['joint']}: {joint['mae']:.4g}, {joint['rmse']:.4g}, {joint['max']:.4g}"

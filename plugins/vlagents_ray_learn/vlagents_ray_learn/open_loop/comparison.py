@@ -45,12 +45,16 @@ _SESSIONS = 8
 
 
 @contextmanager
-def candidate(source: str, overrides: Sequence[Override] = ()) -> Iterator[OpenSession]:
+def candidate(
+    source: str, overrides: Sequence[Override] = (), rows: int | None = None
+) -> Iterator[OpenSession]:
     """Load a policy for the duration of the context.
 
     Args:
         source: The name of a policy, a deployment file, or the URL of a server.
         overrides: Changes of the policy's args. They are not allowed for the policy of a server.
+        rows: The number of rows of each forward pass, as in the recording, if the policy supports
+            `batch.invariant`. The overrides and the settings of the file precede it.
 
     Yields:
         A function that opens sessions, which share the policy's batches.
@@ -63,9 +67,11 @@ def candidate(source: str, overrides: Sequence[Override] = ()) -> Iterator[OpenS
         yield partial(RemoteAgent, source, priority="simulation", codec="exact")
         return
     application = policy_application(source, overrides=overrides)
-    with LocalPolicy(
-        ServerArgs(**application.args), own_settings(application), threaded=True
-    ) as policy:
+    args = ServerArgs(**application.args)
+    if rows is not None and not args.batch.model_fields_set & {"invariant", "sizes"}:
+        batch = args.batch.model_copy(update={"max_size": rows, "invariant": "auto"})
+        args = args.model_copy(update={"batch": batch})
+    with LocalPolicy(args, own_settings(application), threaded=True) as policy:
         policy.initialize()
         yield lambda: policy.sessions(1)[0]
 
@@ -166,6 +172,8 @@ class OpenLoopResult:
     against: str  # "answers" recorded by a server, or "actions" of the dataset
     table: ErrorTable
     sessions: int = 0
+    # The number of frames with recorded answers whose actions are equal to the bit.
+    equal: int = 0
     # The number of calls that are missing in the recording. A policy with a history has therefore
     # received fewer observations than in the recording.
     missing: int = 0
@@ -195,6 +203,7 @@ class OpenLoopResult:
             "against": self.against,
             "sessions": self.sessions,
             "frames": len(self.frames),
+            "equal": self.equal if self.against == "answers" else None,
             "missing_acts": self.missing,
             **self.table.to_json(),
             "by_episode": by_episode,
@@ -223,6 +232,14 @@ def open_datasets(folder: Path) -> list[RecordedDataset]:
                 f"{dataset.root}: has other actions than {first.root}; compare them one by one"
             )
     return datasets
+
+
+def recorded_rows(datasets: Sequence[RecordedDataset]) -> int | None:
+    """Return the number of rows of each forward pass that all datasets record; None if there is
+    none.
+    """
+    sizes = {dataset.rows for dataset in datasets}
+    return sizes.pop() if len(sizes) == 1 else None
 
 
 def compare(
@@ -271,7 +288,9 @@ def compare(
                     "episode": episode.index,
                     "frame": step.frame,
                 }
+                is_equal = expected.tobytes() == actions.astype(np.float32).tobytes()
                 with lock:
+                    result.equal += is_equal
                     mae = result.table.add(expected[:rows], actions[:rows])
                     result.frames.append({**frame, "mae": mae})
         finally:
