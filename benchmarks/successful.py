@@ -67,9 +67,12 @@ class ServedRobot:
             return 0.0
         return sum(delay <= tolerated for delay in self.delays) / len(self.delays)
 
-    def is_successful(self, curve: SuccessCurve) -> bool:
-        """Return whether the robot is successful, as the docstring of the module defines it."""
-        tolerated = curve.tolerated
+    def is_successful(self, tolerated: int) -> bool:
+        """Return whether the robot is successful, as the docstring of the module defines it.
+
+        Args:
+            tolerated: The tolerated delay of the policy, in rows.
+        """
         return self.in_time(tolerated) >= ENOUGH and self.within(tolerated) >= ENOUGH
 
     def tasks_per_hour(self, curve: SuccessCurve) -> float:
@@ -96,7 +99,7 @@ class FleetSuccess:
     def from_robots(cls, robots: Sequence[ServedRobot], curve: SuccessCurve) -> FleetSuccess:
         """Return the figures of robots that share one replica on one GPU."""
         return cls(
-            sum(robot.is_successful(curve) for robot in robots),
+            sum(robot.is_successful(curve.tolerated) for robot in robots),
             sum(robot.tasks_per_hour(curve) for robot in robots),
         )
 

@@ -272,6 +272,32 @@ def ways() -> Iterator[str]:
         yield f"| {row['way']} | {rate} | {off} [{low}, {high}] | {row['p_holm']:.2g} | {equal} |"
 
 
+def successful_robots() -> Iterator[str]:
+    """Yield the rows of the largest fleets of successful robots, and of the tasks per GPU-hour if
+    the success of the policy was measured, from `tests.simulation.robots`.
+    """
+    found = json.loads((ROOT / "tests/simulation/successful.json").read_text())
+    delays = list(found["systems"][0]["largest"])
+    yield f"| rows of a chunk | server and loop | {' | '.join(f'd* = {rows}' for rows in delays)} |"
+    yield "|---" * (2 + len(delays)) + "|"
+    for system in found["systems"]:
+        cells = [system["rows"], system["system"], *system["largest"].values()]
+        yield f"| {' | '.join(map(str, cells))} |"
+
+    if not all(found["curves"].values()):
+        return
+    yield ""
+    loads = ("25 %", "70 %", "105 %")
+    yield f"| rows of a chunk | server and loop | {' | '.join(loads)} of the capacity |"
+    yield "|---" * (2 + len(loads)) + "|"
+    for system in found["systems"]:
+        cells = [system["rows"], system["system"]]
+        for fleet in system["fleets"]:
+            tasks = round(fleet["tasks_per_gpu_hour"])
+            cells.append(f"{fleet['successful']} of {fleet['robots']}: {tasks:,}")
+        yield f"| {' | '.join(map(str, cells))} |"
+
+
 def columns() -> Iterator[str]:
     """Yield the rows of the table of an export's columns."""
     yield from ("| column | type | meaning |", "|---|---|---|")
@@ -303,6 +329,7 @@ PARTS: dict[str, Callable[[], str | Iterable[str]]] = {
     "programs": programs_run,
     "settings of programs": settings_of_programs,
     "success": ways,
+    "successful robots": successful_robots,
     "columns": columns,
     "extras": packages_of_extras,
 }

@@ -63,7 +63,7 @@ def test_a_robot_without_an_answer_within_the_tolerated_delay_is_not_successful(
     robot: ServedRobot, curve: SuccessCurve
 ) -> None:
     if not any(delay <= curve.tolerated for delay in robot.delays):
-        assert not robot.is_successful(curve)
+        assert not robot.is_successful(curve.tolerated)
 
 
 @given(ROBOTS, CURVES)
@@ -73,7 +73,7 @@ def test_a_successful_robot_has_98_of_100_answers_and_ticks(
     tolerated = curve.tolerated
     late = [delay for delay in robot.delays if not delay <= tolerated]
     starved = robot.starved + sum(max(wait - tolerated, 0.0) for wait in robot.waits)
-    if robot.is_successful(curve):
+    if robot.is_successful(curve.tolerated):
         assert len(late) <= 0.02 * len(robot.delays) + 1e-9
         assert starved <= 0.02 * robot.ticks * (1 + 1e-9)
 
@@ -98,7 +98,7 @@ def test_a_later_answer_makes_no_robot_successful(
         delays = list(robot.delays)
         delays[index] += 1
         later = ServedRobot(robot.hz, robot.ticks, robot.starved, robot.waits, delays)
-        assert robot.is_successful(curve) or not later.is_successful(curve)
+        assert robot.is_successful(curve.tolerated) or not later.is_successful(curve.tolerated)
 
 
 def robot(*delays: float, starved: float = 0, waits: tuple[float, ...] = ()) -> ServedRobot:
@@ -122,23 +122,23 @@ def test_the_curve_of_a_loop_is_that_of_its_default_settings_in_the_hardest_envi
 def test_a_chosen_wait_is_in_time_for_as_long_as_the_tolerated_delay() -> None:
     waiting = robot(0, waits=(3.0,) * 30)
     assert waiting.in_time(3) == 1
-    assert waiting.is_successful(CURVE)
+    assert waiting.is_successful(CURVE.tolerated)
     assert waiting.moving() == pytest.approx(100 / 190)
 
     longer = robot(0, waits=(3.1,) * 30)
     assert longer.in_time(3) == pytest.approx(1 - 3 / 193)
-    assert longer.is_successful(CURVE)
-    assert not robot(0, waits=(4.0,) * 30).is_successful(CURVE)
+    assert longer.is_successful(CURVE.tolerated)
+    assert not robot(0, waits=(4.0,) * 30).is_successful(CURVE.tolerated)
 
 
 def test_ticks_without_an_action_are_not_chosen_waits() -> None:
-    assert robot(0, starved=2).is_successful(CURVE)
-    assert not robot(0, starved=3).is_successful(CURVE)
+    assert robot(0, starved=2).is_successful(CURVE.tolerated)
+    assert not robot(0, starved=3).is_successful(CURVE.tolerated)
 
 
 def test_a_robot_that_was_not_served_is_not_successful() -> None:
     for unserved in (robot(), ServedRobot(10.0, 0, 0, (), (0,)), robot(math.inf, math.inf)):
-        assert not unserved.is_successful(CURVE)
+        assert not unserved.is_successful(CURVE.tolerated)
         assert FleetSuccess.from_robots([unserved], CURVE).successful == 0
     assert robot().tasks_per_hour(CURVE) == 0
 

@@ -30,7 +30,6 @@ from in_flight import AnySession, message_of_one
 from benchmarks.robot_process import executed_by_waiting
 from benchmarks.robots import RobotsPlan
 from benchmarks.successful import CHECKPOINT, FleetSuccess, ServedRobot, curve_of
-from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.messages import Priority, Request
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.fair_queue import BEHIND_OTHERS_S, PATIENCE_S
@@ -525,11 +524,16 @@ class System:
         """Run a fleet."""
         return play(PI0, number, self.slack, *kinds, stops=self.stops, batch=self.batch)
 
-    def largest(self, curve: SuccessCurve, *kinds: tuple[int, float]) -> int:
-        """Return the largest fleet of which each robot is successful."""
-        return largest_that(
-            lambda number: self.play(number, *kinds).success(curve).successful == number
-        )
+    def largest(self, tolerated: int, *kinds: tuple[int, float]) -> int:
+        """Return the largest fleet of which each robot is successful, given the tolerated delay of
+        the policy, in rows.
+        """
+
+        def fits(number: int) -> bool:
+            robots = self.play(number, *kinds).robots
+            return all(robot.served().is_successful(tolerated) for robot in robots)
+
+        return largest_that(fits)
 
 
 SYSTEMS = {
@@ -546,46 +550,37 @@ compute one request at a time, and their loops wait for each chunk.
 
 
 LOADS = (0.25, 0.7, 1.05)  # numbers of robots, relative to the capacity (`RobotsPlan.capacity`)
+TOLERATED = (1, 2, 3, 5)  # tolerated delays of policies, in rows
 
 
 def successful(checkpoint: Path) -> dict[str, Any]:
-    """Return the largest fleets of successful robots, and the figures of fleets of fixed sizes, as
-    JSON; print them as they come.
+    """Return the largest fleets of successful robots by the tolerated delay of the policy, and, if
+    the success of a checkpoint was measured, the tasks per GPU-hour of fleets of fixed sizes.
+
+    The result is JSON. It is also printed.
 
     Args:
-        checkpoint: The folder of the checkpoint whose success is assumed.
-
-    Raises:
-        ConfigError: The success of the checkpoint was not measured.
+        checkpoint: The folder of the checkpoint.
     """
-    curves: dict[bool, SuccessCurve] = {}
-    for stops, loop in ((False, "player"), (True, "waiting")):
-        curve = curve_of(checkpoint, loop)
-        if curve is None:
-            raise ConfigError(
-                f"{checkpoint}: expected its success with the loop {loop!r}, got none; measure it "
-                "with `python -m benchmarks.delays --curves`"
-            )
-        curves[stops] = curve
-        print(f"{loop}: tolerated delay {curve.tolerated} rows; {curve.mode}, {curve.settings}")
-
-    print("simulated: rows, system, robots: successful, tasks per GPU-hour")
+    curves = {loop: curve_of(checkpoint, loop) for loop in ("player", "waiting")}
     entries = []
     for rows, (name, system) in itertools.product((8, 50), SYSTEMS.items()):
-        kind, curve = (rows, 10.0), curves[system.stops]
-        capacity = RobotsPlan().capacity(str(rows))
-        largest = system.largest(curve, kind)
+        kind = (rows, 10.0)
+        largest = {str(delay): system.largest(delay, kind) for delay in TOLERATED}
+        print(f"simulated, {rows} rows, {name}: largest successful fleets {largest}", flush=True)
+
         fleets = []
-        for number in (largest, *(round(load * capacity) for load in LOADS)):
-            found = FleetSuccess(0, 0.0)
-            if number:
+        curve = curves["waiting" if system.stops else "player"]
+        if curve is not None:
+            for load in LOADS:
+                number = round(load * RobotsPlan().capacity(str(rows)))
                 found = system.play(number, kind).success(curve)
-            fleets.append({"robots": number, **asdict(found)})
-            print(f"{rows:3} {name:36} {number:4}: {found}", flush=True)
-        entries.append({"rows": rows, "system": name, "largest": fleets[0], "fleets": fleets[1:]})
+                fleets.append({"robots": number, **asdict(found)})
+                print(f"  {number} robots: {found}", flush=True)
+        entries.append({"rows": rows, "system": name, "largest": largest, "fleets": fleets})
     return {
         "curves": {
-            "waiting" if stops else "player": one.to_json() for stops, one in curves.items()
+            loop: None if curve is None else curve.to_json() for loop, curve in curves.items()
         },
         "systems": entries,
     }
