@@ -164,9 +164,9 @@ class Figures:
             return
 
         self.ticks += 1
-        # A tick that needs no action of the policy, although no operator moves the robot, is a wait
-        # that the player chose.
-        is_waiting = not row and IN_TIME not in info
+        # A tick without a row that is nevertheless in time, or needs no action of the policy, is a
+        # wait that the player chose.
+        is_waiting = not row and info.get(IN_TIME, True)
         if row:
             self.ages.append(info[AGE_MS])
         elif is_waiting:

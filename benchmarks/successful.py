@@ -78,7 +78,9 @@ class ServedRobot:
     def tasks_per_hour(self, curve: SuccessCurve) -> float:
         """Return the number of tasks that the robot solves in an hour, according to the curve.
 
-        Answers without a row left do not count, as they move no robot; the robot then starves.
+        Answers without a row left do not count, as they move no robot; the robot then starves. The
+        waits are those of a waiting loop. Those of the chunk player, before it moves a gripper, are
+        in the ticks of the curve, and the policy of the benchmark moves no gripper.
         """
         delays = [delay for delay in self.delays if math.isfinite(delay)]
         if not delays:

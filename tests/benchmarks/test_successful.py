@@ -180,9 +180,10 @@ def test_answers_before_the_measurement_are_not_counted() -> None:
     assert (figures.ticks, figures.delays) == (2, [1])
 
 
-def test_a_tick_that_needs_no_action_is_a_chosen_wait() -> None:
+@pytest.mark.parametrize("in_time", [{IN_TIME: True}, {}])
+def test_a_tick_that_is_in_time_without_a_row_is_a_chosen_wait(in_time: dict[str, bool]) -> None:
     figures = Figures()
-    chosen = {SAFE: "careful", CAUSE: WAITING.cause}
+    chosen = {SAFE: "careful", CAUSE: WAITING.cause, **in_time}
     for info in [row(0, 0), chosen, chosen, row(1, 0), chosen, {**chosen, IN_TIME: False}]:
         figures.count(info, is_counted=True)
     assert (figures.ticks, figures.late, figures.waits) == (6, 1, [2, 1])
