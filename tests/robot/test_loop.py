@@ -606,3 +606,49 @@ def test_a_robot_without_close_is_freed_before_its_libraries_end() -> None:
     )  # fmt: skip
     assert done.stdout.splitlines() == ["the renderer is freed", "the library ends"]
     assert done.stderr == ""
+
+
+class Chunking(Agent):
+    """A policy that returns chunks, and must be open when it is used."""
+
+    def __init__(self, delta: bool | None) -> None:
+        self.is_open = False
+        self._delta = delta
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(action=ActionSpec(dim=2, delta=self._delta, low=-1.0), chunk=6)
+
+    def initialize(self) -> None:
+        self.is_open = True
+
+    def act(self, obs: Obs) -> Act:
+        assert self.is_open
+        return Act(np.full((6, 2), 0.01, np.float32))
+
+    def close(self) -> None:
+        self.is_open = False
+
+
+@pytest.mark.parametrize("delta", [True, False])
+@pytest.mark.parametrize("guarded", [False, True])
+def test_chunks_are_executed_in_the_mode_that_is_chosen_for_their_policy(
+    delta: bool, guarded: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    agent = Chunking(delta)
+    options = LoopOptions(guard=Guard(agent.contract) if guarded else None)
+    caplog.set_level("INFO")
+    for _ in range(2):  # the loop leaves the agent of its caller open
+        robot = SimulatedRobot(agent.contract)
+        report = run_loop(robot, agent, hz=50, seconds=0.2, options=options)
+        assert report.timeliness.time_share.share > 0
+        assert report.rows_per_tick is not None
+        assert agent.is_open
+    kind = "relative" if delta else "absolute"
+    assert f"mode async: the contract declares {kind} actions; no measured" in caplog.text
+
+
+def test_chunks_without_a_declared_meaning_need_a_safe_action_that_the_caller_knows() -> None:
+    agent = Chunking(None)
+    with pytest.raises(ConfigError, match="safe"):
+        run_loop(SimulatedRobot(agent.contract), agent, hz=50, seconds=0.2)

@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, TypeVar, get_args
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from vlagents_ray.abilities import (
     Interruptible,
     ability,
 )
+from vlagents_ray.chunking.choice import choose_for
 from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.fallback import Cause, Held
 from vlagents_ray.chunking.player import ChunkPlayer
@@ -60,6 +61,7 @@ from vlagents_ray.settings import require_arguments
 from vlagents_ray.signals import END_SIGNALS, ended_by_signals, raise_dropped
 from vlagents_ray.viewers import EpisodeViewer, LoopView
 
+T = TypeVar("T")
 Restart = Literal["manual", "auto"]
 logger = logging.getLogger(__name__)
 
@@ -528,8 +530,9 @@ def run_loop(
 
     Args:
         robot: The robot.
-        agent: The policy. Its actions must be single rows, (D,); a `ChunkPlayer` turns chunks into
-            rows.
+        agent: The policy. A `ChunkPlayer` turns chunks into rows. An agent whose contract declares
+            chunks is executed by one in the mode that is chosen for it
+            (`vlagents_ray.chunking.choice`), which is logged.
         hz: The control rate, Hz.
         seconds: The length of the run, s; None runs until the policy or `until` ends it.
         until: Ends the loop when it returns True; called before each tick, and after the last one.
@@ -557,6 +560,23 @@ def run_loop(
         InvalidAction: An action is a chunk, or the guard rejects an action.
     """
     options = options or LoopOptions()
+    if _returns_chunks(agent):
+        choice = choose_for(agent, hz=hz)
+        logger.info("%s", choice.line)
+        guard = options.guard or Guard(agent.contract)
+        with ChunkPlayer(_Borrowed(agent), choice.settings, check=guard) as player:
+            return run_loop(
+                robot,
+                player,
+                hz=hz,
+                seconds=seconds,
+                until=until,
+                instruction=instruction,
+                watchdog=watchdog,
+                recorder=recorder,
+                options=replace(options, guard=None),
+            )
+
     restart = options.restart
     if restart is None:
         restart = "auto" if getattr(robot, "simulated", False) else "manual"
@@ -638,6 +658,36 @@ def run_loop(
             robot.stop()  # before the watchdog and the recorder are closed
     report.log_warnings()
     return report
+
+
+def _returns_chunks(agent: Agent) -> bool:
+    """Initialize an agent; return whether it declares chunks and has no player for them."""
+    if ability(agent, HasControl) is not None:
+        return False
+    agent.initialize()
+    contract = agent.contract
+    return contract is not None and contract.chunk is not None and contract.chunk > 1
+
+
+class _Borrowed(Agent):
+    """An agent of the caller, which is not closed with its player."""
+
+    def __init__(self, agent: Agent) -> None:
+        self._agent = agent
+
+    @property
+    def contract(self) -> Contract | None:
+        return self._agent.contract
+
+    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+        return self._agent.reset(obs, instruction, **kwargs)
+
+    def act(self, obs: Obs) -> Act:
+        return self._agent.act(obs)
+
+    def forwarded(self, protocol: type[T]) -> T | None:
+        """Return an ability of the agent."""
+        return ability(self._agent, protocol)
 
 
 def _shared_control(
