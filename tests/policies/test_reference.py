@@ -320,6 +320,29 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(learnt: Any) -> 
     )
 
 
+def test_a_flow_without_initial_noise_has_one_chunk_for_an_observation(
+    folder: Path, loaded: Any
+) -> None:
+    still = made(folder, initial_noise=0.0)
+    views = [seen(0, **{SAMPLES: 3}), seen(1)]
+
+    def chunks(policy: Any, seed: int) -> list[Any]:
+        sessions = [begun(policy, seed + number) for number in range(len(views))]
+        return list(policy.act_batch(views, sessions))
+
+    first, second = chunks(still, 0), chunks(still, 5)
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.action, other.action)
+    assert np.abs(first[0].action - first[1].action).max() > 0, "the observation matters"
+    samples = first[0].info[DISTRIBUTION]["samples"]
+    assert np.abs(samples - second[0].info[DISTRIBUTION]["samples"]).max() > 0
+
+    usual = chunks(made(folder, initial_noise=1.0), 0)
+    for one, other in zip(chunks(loaded, 0), usual, strict=True):
+        np.testing.assert_array_equal(one.action, other.action)
+    assert np.abs(usual[0].action - first[0].action).max() > 0
+
+
 def test_compiled_in_bfloat16_and_with_pushed_weights_it_stays_itself(
     folder: Path, loaded: Any
 ) -> None:

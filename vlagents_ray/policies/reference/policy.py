@@ -31,6 +31,7 @@ from vlagents_ray.policies.reference.checkpoint import (
     WEIGHTS,
     Checkpoint,
     Embodiment,
+    NetworkSizes,
     normalised,
     pixels,
     read_checkpoint,
@@ -62,6 +63,14 @@ class ReferenceConfig(AdapterConfig):
         description="the robot, as the checkpoint names it; unset: the only one that it has",
     )
     steps: int = Field(default=5, ge=1, description="steps of the flow")
+    initial_noise: float = Field(
+        default=1.0,
+        ge=0,
+        le=1,
+        description="standard deviation of the noise from which the flow begins; 1: as in "
+        "training; 0: equal observations have equal chunks, and the chunks of successive "
+        "observations agree, which helps if answers are late",
+    )
     guidance: Guidance = 5.0
     noise_level: NoiseLevel = 0.0
 
@@ -204,7 +213,7 @@ class Reference(ModelPolicy):
                 rows,
                 [inputs["images"].unbind(1), cameras, tokens, tokens != 0, inputs["state"]],
                 owners,
-                noise=np.stack([row.noise(sizes.horizon, sizes.action) for row in rows]),
+                noise=np.stack([self._initial_noise(row, sizes) for row in rows]),
                 steps=self.config.steps,
                 config=self.config,
                 dim=sizes.action,
@@ -215,6 +224,15 @@ class Reference(ModelPolicy):
             info = {GIVEN: length} if length else {}
             predictions.append(Prediction(flow, behaviour=outputs.get(i, {}), info=info))
         return predictions
+
+    def _initial_noise(self, row: Row, sizes: NetworkSizes) -> np.ndarray:
+        """Return the noise from which the flow of a row begins, (H, D) float32.
+
+        The further samples of an observation have the noise of the training, since they show how
+        far the policy's plans differ.
+        """
+        noise = row.noise(sizes.horizon, sizes.action)
+        return noise if row.sample else np.float32(self.config.initial_noise) * noise
 
     def _prefix(self, row: Row) -> int:
         """Return the number of rows of the executed plan with which a row's chunk begins."""
