@@ -136,6 +136,17 @@ def test_ticks_without_an_action_are_not_chosen_waits() -> None:
     assert not robot(0, starved=3).is_successful(CURVE.tolerated)
 
 
+def test_an_answer_with_the_tolerated_delay_is_within_it() -> None:
+    assert robot(3, 3).is_successful(CURVE.tolerated)
+    assert not robot(3, 4).is_successful(CURVE.tolerated)
+
+
+def test_a_wait_of_unknown_duration_is_not_in_time() -> None:
+    assert robot(0).in_time(3) == 1
+    unknown = ServedRobot(10.0, 100, 0, (math.nan,), (0,))
+    assert (unknown.in_time(3), unknown.moving()) == (0, 0)
+
+
 def test_a_robot_that_was_not_served_is_not_successful() -> None:
     for unserved in (robot(), ServedRobot(10.0, 0, 0, (), (0,)), robot(math.inf, math.inf)):
         assert not unserved.is_successful(CURVE.tolerated)

@@ -85,7 +85,7 @@ def test_the_tolerated_age_is_that_of_the_last_row_at_the_tolerated_delay() -> N
 
 def test_the_tolerated_age_is_that_of_the_hardest_environment_and_the_best_settings() -> None:
     curves = [curve(5, execute=4), curve(2, "hard", execute=4), curve(1, "hard", execute=8)]
-    assert tolerated_age_ms(curves[:2]) == 6 * 50
+    assert tolerated_age_ms(curves[:2]) == tolerated_age_ms(curves[1::-1]) == 6 * 50
     assert tolerated_age_ms(curves) == 9 * 50
     # Robots that wait for each answer tolerate any delay, and robots do not wait by default.
     waits = curve(8, mode="open_loop", execute=4)
