@@ -28,6 +28,7 @@ from torch.nn.functional import smooth_l1_loss
 from vlagents_ray.columns import Columns
 from vlagents_ray.datasets.episode import INTERVENTION_COLUMN
 from vlagents_ray.policies.base.model_inputs import resize_with_pad, state_vector
+from vlagents_ray.policies.prefixes import with_errors
 from vlagents_ray.policies.reference.checkpoint import (
     CAMERAS,
     CONFIG,
@@ -57,10 +58,8 @@ WARM_UP = 200  # number of steps after which the learning rate falls as a cosine
 # belong to which objects in images.
 OBJECTS = 1.0
 AVERAGE = 0.999  # decay per step of the average of the weights, which is saved
-# With `--delays`, the share of the chunks whose given rows have errors, and the largest standard
-# deviations of these errors, for the whole prefix and for each row, in units of an action. With
-# the demonstrated rows alone, a network learns to copy them, and never how to return to the path.
-ERRONEOUS, ERROR = 0.5, 0.4
+# With `--delays`, the share of the chunks whose given rows have errors.
+ERRONEOUS = 0.5
 # The modules that are trained with `--delays`. The images are encoded as before.
 HEAD = ("context", "noisy", "when", "why", "blocks", "result", "given")
 MADE = "training.json"
@@ -277,35 +276,6 @@ def encoded(network: ReferenceNetwork, frames: Frames, batch: np.ndarray) -> tor
         frames.tokens[index], frames.state[index].to(dtype), *images
     )
     return features
-
-
-def with_errors(
-    actions: torch.Tensor, lengths: torch.Tensor, relative: torch.Tensor, draws: torch.Generator
-) -> torch.Tensor:
-    """Return chunks whose given rows have errors, and whose later rows return to the demonstrated
-    path as fast as the limits of an action allow.
-
-    The errors are of relative columns alone: a target leads back to the path by itself.
-
-    Args:
-        actions: The demonstrated chunks, (B, H, D) in [-1, 1].
-        lengths: The number of given rows with errors of each chunk, (B,); 0 changes nothing.
-        relative: Whether each value is relative, (B, D).
-        draws: The generator of the errors.
-    """
-    size = ERROR * torch.rand(len(actions), 1, 1, generator=draws)
-    errors = torch.randn(actions.shape, generator=draws)
-    errors = size * (errors + torch.randn(actions[:, :1].shape, generator=draws))
-    path, reached = actions.cumsum(1), torch.zeros_like(actions[:, 0])
-    rows = []
-    for row in range(actions.shape[1]):
-        is_given = (row < lengths)[:, None]
-        returning = path[:, row] - reached
-        step = torch.where(is_given, actions[:, row] + errors[:, row], returning).clamp(-1, 1)
-        reached = reached + step
-        rows.append(step)
-    is_changed = (lengths > 0)[:, None, None] & relative[:, None]
-    return torch.where(is_changed, torch.stack(rows, 1), actions)
 
 
 def loss_of(

@@ -41,6 +41,12 @@ class LeRobotConfig(AttentionConfig, AdapterConfig):
         "for smolvla, pi0, pi05, pi0_fast and xvla",
     )
     noise_level: NoiseLevel = 0.0
+    longest_prefix: int = Field(
+        default=0,
+        ge=0,
+        description="largest number of given rows with which a smolvla was trained to begin its "
+        "chunks, as by examples/learn/prefixes.py; 0: chunks are guided",
+    )
     trust_remote_code: bool = Field(
         default=False,
         description="run the code that the checkpoint names: processor steps that are not "

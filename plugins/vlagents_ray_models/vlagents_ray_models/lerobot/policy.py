@@ -146,6 +146,13 @@ class LeRobot(ModelPolicy):
                 f"attention flex: expected LeRobot's 'pi0' or 'pi05' for it, got {policy_type!r}; "
                 "leave it out"
             )
+        if self.config.longest_prefix:
+            if not isinstance(sampler, samplers.FlowSampler) or policy_type != "smolvla":
+                raise ConfigError(
+                    f"longest_prefix: expected LeRobot's 'smolvla' for it, got {policy_type!r}; "
+                    "leave it out: the config of a π0.5 contains its own"
+                )
+            sampler.read_prefixes(self.config.longest_prefix)
         if isinstance(sampler, samplers.FlowSampler):
             sampler.noise_level = self.config.noise_level
         elif self.config.noise_level:

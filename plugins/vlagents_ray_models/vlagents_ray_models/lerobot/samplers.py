@@ -8,7 +8,7 @@ to them.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
@@ -261,10 +261,14 @@ class FlowSampler(Sampler):
         # The policy calls this function after preparing the inputs and before converting the
         # actions.
         model.sample_actions = self.passes.sample
-        has_prefixes = getattr(policy.rtc_processor.rtc_config, "mode", "guided") == "trained"
-        # Longest prefix, rows.
-        self.longest = int(getattr(config, LONGEST_PREFIX)) if has_prefixes else 0
-        self.passes.by_row = has_prefixes
+        self.longest = 0  # longest prefix, rows
+        if getattr(policy.rtc_processor.rtc_config, "mode", "guided") == "trained":
+            self.read_prefixes(int(getattr(config, LONGEST_PREFIX)))
+
+    def read_prefixes(self, longest: int) -> None:
+        """Begin chunks with at most this number of given rows, in place of guidance."""
+        self.longest = longest
+        self.passes.by_row = True
 
     def observed_rows(self, rows: Sequence[Row]) -> list[int]:
         return self._shared(rows)[0]
@@ -375,6 +379,26 @@ def guide_of(
     return Guide(target, np.zeros_like(weights), weights) if weights.any() else None
 
 
+def accept_times_of_rows(model: Any) -> None:
+    """Let SmolVLA's `embed_suffix` also accept a flow time for each row of a chunk, (B, H).
+
+    Each row is embedded alone, with its time.
+
+    Args:
+        model: A `VLAFlowMatching`.
+    """
+    embed: Callable[[Any, Any], tuple[Any, Any, Any]] = model.embed_suffix
+
+    def embed_with_times(actions: Any, times: Any) -> tuple[Any, Any, Any]:
+        if times.ndim == 1:
+            return embed(actions, times)
+        embedded, _, _ = embed(actions.flatten(0, 1)[:, None], times.flatten())
+        _, present, causal = embed(actions, times[:, 0])
+        return embedded.unflatten(0, times.shape)[:, :, 0], present, causal
+
+    model.embed_suffix = embed_with_times
+
+
 class SmolVLAPasses(FlowPasses):
     """The forward passes of SmolVLA, which encode images from their patches."""
 
@@ -390,6 +414,7 @@ class SmolVLAPasses(FlowPasses):
         self._by_name = "fill_kv_cache" in parameters
         # Height and width of an image -> the positions of its patches, (L,).
         self._positions: dict[tuple[int, int], Any] = {}
+        accept_times_of_rows(model)
         self._embed_image = model.vlm_with_expert.embed_image
         model.vlm_with_expert.embed_image = self._embed
 

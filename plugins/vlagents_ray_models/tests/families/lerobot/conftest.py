@@ -26,7 +26,15 @@ torch.set_num_threads(1)  # the models are too small for more: threads would wai
 PATCHED = tiny.NEW or importlib.util.find_spec("transformers.models.siglip.check") is not None
 LEFT_OUT: dict[str, str] = {}  # why a file is not run here, for docs/policies/verification.md
 if tiny.NEW:
-    of_both = ("adapters", "hilserl", "learning", "pi_recipe", "plugins", "recipe")
+    of_both = (
+        "adapters",
+        "hilserl",
+        "learning",
+        "pi_recipe",
+        "plugins",
+        "prefix_training",
+        "recipe",
+    )
     LEFT_OUT |= dict.fromkeys(
         (f"test_{name}.py" for name in of_both),
         "it runs with LeRobot 0.4 only",
@@ -45,6 +53,7 @@ if importlib.util.find_spec("ray") is None:
         "test_async_client.py",
         "test_commands.py",
         "test_hilserl.py",
+        "test_prefix_training.py",
         "test_training.py",
     )
     LEFT_OUT |= dict.fromkeys(of_ray, "this environment has no Ray")
