@@ -150,6 +150,11 @@ class Columns:
             return None
         return self.gripper_closed + opening * (self.gripper_open - self.gripper_closed)
 
+    @property
+    def gripper_middle(self) -> float | None:
+        """The command between an open and a closed gripper; None if one of them is unknown."""
+        return self.gripper_command(0.5)
+
     def travel(self, start: np.ndarray, goal: np.ndarray, begin: float, end: float) -> np.ndarray:
         """Return the command for a part of the way from one row of a plan to the next.
 

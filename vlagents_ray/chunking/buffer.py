@@ -13,7 +13,7 @@ import functools
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -72,6 +72,7 @@ class Origin(NamedTuple):
     """The pose of the robot at an observation, as a position in the motions of a plan."""
 
     motions: int  # the number of motions before the observation
+    executed: int  # `ChunkBuffer.executed` at the observation
     # The part of the next row, (D,), that was executed before the observation in an ease-in, which
     # divides rows; None if there is none.
     part: np.ndarray | None = None
@@ -106,6 +107,8 @@ class Step(NamedTuple):
     row: int  # index of the row in that chunk
     # Whether the action contains a part of the way back to the path of a chunk.
     is_corrected: bool = False
+    age: int = 0  # the number of executed actions since the observation of the chunk
+    is_fresh: bool = False  # whether no action was executed while the chunk was computed
 
     def with_action(self, action: np.ndarray, tick: int, silent_s: float) -> Act:
         """Return `action` in place of the planned action of a tick, with the info of the planned
@@ -133,6 +136,8 @@ class _Planned:
     # The way from the robot to the pose that the chunk's rows up to now reach from the pose of its
     # observation, (D,); None if the robot is at this pose.
     way: np.ndarray | None
+    observed: int  # `ChunkBuffer.executed` at the chunk's observation
+    is_fresh: bool  # whether no action was executed while the chunk was computed
 
 
 class _Motion(NamedTuple):
@@ -267,7 +272,9 @@ class ChunkBuffer:
         columns = self._set_columns(chunk.rows.shape[1])
         if self._is_anchored:
             self._reach = np.maximum(self._reach, columns.reach(chunk.rows))
-        self._chunks.append(_Planned(chunk, origin.motions, origin.part))
+        is_fresh = origin.executed == self.executed
+        planned = _Planned(chunk, origin.motions, origin.part, origin.executed, is_fresh)
+        self._chunks.append(planned)
         self._step = None
         self._observed = None
         self._forget(min(planned.counted for planned in self._chunks))
@@ -279,7 +286,7 @@ class ChunkBuffer:
         The motions since then are remembered until this chunk is added.
         """
         self._observed = self._forgotten + len(self._motions)
-        return Origin(self._observed, self._part)
+        return Origin(self._observed, self.executed, self._part)
 
     @property
     def next(self) -> Step | None:
@@ -301,6 +308,18 @@ class ChunkBuffer:
         ahead.advance()
         step = ahead.next
         return None if step is None else step.action
+
+    @property
+    def columns(self) -> Columns | None:
+        """The meaning of the columns of actions; None before the first action or chunk."""
+        return self._columns
+
+    def steps(self) -> Iterator[Step]:
+        """Yield the steps from `next` on, if each is executed as planned."""
+        ahead = self._ahead()
+        while (step := ahead.next) is not None:
+            yield step
+            ahead.advance(step.action)
 
     @property
     def known(self) -> int:
@@ -387,6 +406,8 @@ class ChunkBuffer:
         step: int | None = None,
         tick: int = 0,
         origin: Origin | None = None,
+        *,
+        done: bool = False,
     ) -> None:
         """Replace all chunks with a single chunk.
 
@@ -395,11 +416,12 @@ class ChunkBuffer:
             step: The step of its first row; None: the next step.
             tick: The tick of its observation.
             origin: `origin` at its observation; None: the pose before the action of `step`.
+            done: Whether the policy ends the episode with its last row.
         """
         self._chunks.clear()
         self._step = None
         first = self.executed if step is None else step
-        self.add(Chunk(0, first, rows, tick=tick, origin=origin))
+        self.add(Chunk(0, first, rows, done, tick=tick, origin=origin))
 
     def leftover(self) -> np.ndarray | None:
         """Return the remaining actions as the robot will execute them, (H', D); None if there are
@@ -408,11 +430,7 @@ class ChunkBuffer:
         They are within the limits of the contract and of the guard. Otherwise, a policy that
         continues them would amplify its own numbers from request to request.
         """
-        rows: list[np.ndarray] = []
-        ahead = self._ahead()
-        while (step := ahead.next) is not None:
-            rows.append(step.action)
-            ahead.advance(step.action)
+        rows = [step.action for step in self.steps()]
         return np.clip(np.stack(rows), self._low, self._high) if rows else None
 
     def continuation(self, delay: int) -> dict[str, Any]:
@@ -448,6 +466,12 @@ class ChunkBuffer:
             self._reach = np.zeros_like(self._reach)
         return len(self._chunks) < count
 
+    def keep_newest(self) -> None:
+        """Drop all chunks but the newest."""
+        while len(self._chunks) > 1:
+            self._chunks.popleft()
+        self._step = None
+
     def _next(self, *, is_anchored: bool) -> Step | None:
         """Return the step to execute now, with or without the ways to the paths of the chunks."""
         index = self.executed
@@ -474,7 +498,9 @@ class ChunkBuffer:
         action = self._merged(rows)
         if has_way:
             action = self._limited(action, newest_row)
-        return Step(action, newest.chunk, index - newest.chunk.step, has_way)
+        row = index - newest.chunk.step
+        age = index - newest.observed
+        return Step(action, newest.chunk, row, has_way, age, newest.is_fresh)
 
     def _merged(self, rows: Sequence[np.ndarray]) -> np.ndarray:
         """Return the action of the rows of several chunks for a step, oldest first, (D,)."""
@@ -554,8 +580,8 @@ class ChunkBuffer:
         """Return the pose of the robot before the action of a step."""
         for number, motion in enumerate(self._motions, self._forgotten):
             if motion.step is not None and motion.step >= step:
-                return Origin(number)
-        return Origin(self._forgotten + len(self._motions))
+                return Origin(number, step)
+        return Origin(self._forgotten + len(self._motions), step)
 
     def _ahead(self) -> ChunkBuffer:
         """Return a copy of the plan, which may be executed while this one stays as it is."""

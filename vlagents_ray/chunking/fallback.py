@@ -31,6 +31,9 @@ Cause = Literal[
     # The last answer has no rows left, and the next answer is pending. This is not counted as
     # `safe`.
     "waiting",
+    # The next row moves a gripper because of an old observation, and the robot waits for a new
+    # answer, as it was told to. This is not counted as `safe`.
+    "careful",
     "late",  # the answer arrived after all its rows, or the leftover rows in its request, were due
     "old",  # the plan is older than max_age_s
     "stale",  # the observation is older than max_age_s
@@ -56,6 +59,11 @@ class Held(NamedTuple):
 
 
 WAITING = Held("waiting", "waiting for an answer: all rows of the last one have been executed")
+CAREFUL = Held(
+    "careful",
+    "the next row moves a gripper, but its observation is as old as fresh_grip: waiting for a new "
+    "answer",
+)
 LATE = Held(
     "late",
     "the answer came so late that the robot had passed its rows; lower the latency, or the rate "

@@ -27,8 +27,10 @@ from vlagents_ray.chunking.buffer import (
     Step,
     stamped,
 )
+from vlagents_ray.chunking.careful import FRESH_GRIP, CarefulRows
 from vlagents_ray.chunking.control import Leader, RobotControl
 from vlagents_ray.chunking.fallback import (
+    CAREFUL,
     LATE,
     OLD,
     RELEASED,
@@ -195,11 +197,22 @@ class PlayerSettings:
     first, or since the call of `act` (see `CaptureClock`).
     """
     safe: Safe = "auto"  # action that replaces a missing one (see `SafeAction`)
+    fresh_grip: int | None = FRESH_GRIP
+    """The age, in rows, from which the observation of a row is too old to open or close a gripper.
+
+    Before such a row, the robot stands and waits for the answer to a new observation (see
+    `vlagents_ray.chunking.careful`). The setting has an effect if the measured delay of answers is
+    at least as long. None: the robot never waits.
+    """
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
             raise ConfigError(f"mode: expected one of {list(get_args(Mode))}, got {self.mode!r}")
-        for name, value in (("execute", self.execute), ("horizon", self.horizon)):
+        for name, value in (
+            ("execute", self.execute),
+            ("horizon", self.horizon),
+            ("fresh_grip", self.fresh_grip),
+        ):
             if value is not None and value < 1:
                 raise ConfigError(f"{name}: expected a number of at least 1, or None, got {value}")
         if self.max_age_s is not None and not self.max_age_s > 0:
@@ -277,6 +290,7 @@ class ChunkPlayer(Agent):
         self._agent = agent
         merge = ENSEMBLE if settings.mode == "ensemble" else settings.merge
         self._plan = ChunkBuffer(merge, settings.ensemble_m)
+        self._careful = CarefulRows(self._plan, settings.fresh_grip)
         self._caller: AsyncCaller | None = None
         self._contract: Contract | None = None
         self._arm: ActionSpec | None = None  # the actions of the arm's contract
@@ -285,6 +299,8 @@ class ChunkPlayer(Agent):
 
     def _begin(self) -> None:
         self._plan.drop()
+        self._careful.forget()
+        self._careful_ticks = 0  # the number of ticks for which the robot has been standing
         self._tick: int | None = None  # tick of the next `act`; None outside of an episode
         self._request = _Request()  # the last request
         self._drops_answer = False  # whether the answer to the last request must not be executed
@@ -489,7 +505,7 @@ class ChunkPlayer(Agent):
             if left_s <= 0:
                 break
             is_of_this_tick = self.settings.mode != "async" and self._request.tick == tick
-            if not is_of_this_tick and self._next() is not None:
+            if not is_of_this_tick and self._next() is not None and not self._stands():
                 break
             self._receive(caller.take(left_s), tick)
 
@@ -526,6 +542,12 @@ class ChunkPlayer(Agent):
             self._reason = OLD
         return self._plan.next
 
+    def _stands(self) -> bool:
+        """Return whether the robot waits for a new answer before it moves a gripper."""
+        if self.control.state != "autonomous":
+            return False
+        return self._careful.stands(self._motion.last, self._delay.ticks)
+
     def _is_request_due(self, tick: int, obs: Obs) -> bool:
         """Return whether a request with this tick's observation is due."""
         if self._is_old(self._captured(obs)):
@@ -533,6 +555,8 @@ class ChunkPlayer(Agent):
         step = self._next()
         if step is None or step.chunk.done:
             return step is None
+        if self._stands():
+            return True
         if self.settings.mode == "open_loop":
             return self.settings.execute is not None and step.row >= self.settings.execute
 
@@ -607,7 +631,10 @@ class ChunkPlayer(Agent):
 
         tick, step, seen_at, origin = self._request
         chunk = Chunk(self._chunks, step, rows, act.done, info, tick, seen_at, origin)
+        awaited = self._careful.awaited(self._motion.last, self._delay.ticks)
         added = self._plan.add(chunk)
+        if added:
+            self._careful.answered(awaited)
         self._chunks += 1
         self._reason = WAITING if added else LATE
         self._begins_again = False
@@ -630,7 +657,8 @@ class ChunkPlayer(Agent):
 
         # While an operator moves the robot, their actions replace the plan.
         if self.settings.real_time_chunking and self.control.state != "human":
-            info |= self._plan.continuation(self._delay.ticks)
+            delay = self._careful.rows_ahead(self._motion.last, self._delay.ticks)
+            info |= self._plan.continuation(delay)
         return info
 
     def _operator_act(self, obs: Obs) -> Act:
@@ -681,7 +709,12 @@ class ChunkPlayer(Agent):
         if step is not None or not is_not_expected:
             timing[IN_TIME] = step is not None
 
-        if step is not None:
+        is_standing = step is not None and self._motion.can_hold and self._stands()
+        if is_standing:
+            why, timing[IN_TIME] = self._standing()
+        else:
+            self._careful_ticks = 0
+        if step is not None and not is_standing:
             try:
                 action, rows = self._motion.follow(self._plan, obs)
             except InvalidAction as error:
@@ -695,6 +728,7 @@ class ChunkPlayer(Agent):
                 act.info.update(timing)
                 self._ticks_of_rows += 1
                 self.rows += rows
+                self._careful.executed(action)
                 # Without a row, the command is still approaching it.
                 return act if rows else replace(act, done=False)
 
@@ -715,9 +749,22 @@ class ChunkPlayer(Agent):
         info = {SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s(), **timing}
         return Act(action, info=info)
 
+    def _standing(self) -> tuple[Held, bool]:
+        """Return why the robot stands before it moves a gripper, and whether it stands by choice.
+
+        The answer to a request in progress and the answer to the next request take twice the
+        measured delay. If they take longer, or the server failed, the answer is missing.
+        """
+        self._careful_ticks += 1
+        is_failed = self._reason.cause in ("lost", "failed")
+        if is_failed or self._careful_ticks > 2 * self._delay.ticks + 1:
+            return self._reason if is_failed else WAITING, False
+        return CAREFUL, True
+
     def _begin_again(self, why: Held) -> None:
         """Drop the plan and the pending answer, and wait for the answer to a new observation."""
         self._plan.drop()
+        self._careful.forget()
         self._drops_answer = True
         self._begins_again = True
         self._reason = why

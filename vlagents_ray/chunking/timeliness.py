@@ -3,7 +3,8 @@
 A tick counts if an action of the policy is due at it. Ticks do not count while the robot is paused,
 stopped or moved by an operator, and while it waits for the first answer after that. A tick is
 *starved* if no answer had a row for it. Later events, such as a rejection of the row by the guard,
-do not matter here.
+do not matter here. A tick at which the robot waits by choice, before it moves a gripper
+(`vlagents_ray.chunking.careful`), had a row, and is also counted as *careful*.
 
 Chunk players, the control loop of a robot, evaluations in real time and replicas all count with
 `Timeliness`, or report a `TimeShare`.
@@ -17,7 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from vlagents_ray.errors import Overloaded, PolicyUnavailable, TooManyRequests, UnknownSession
-from vlagents_ray.interface import AGE_MS, IN_TIME
+from vlagents_ray.interface import AGE_MS, CAUSE, IN_TIME
 
 KEPT_AGES = 10_000  # number of stored ages: 1,000 s at 10 Hz
 # After these errors no replica has executed the request, which may be sent again.
@@ -69,18 +70,21 @@ class Timeliness:
     def __init__(self) -> None:
         self.ticks = 0  # ticks at which an action of the policy was due
         self.starved = 0  # ticks without a row of an answer
+        self.careful = 0  # ticks at which the robot waited by choice before it moves a gripper
         self._ages_ms: deque[float] = deque(maxlen=KEPT_AGES)
         # Ticks and starved ticks that requests have reported, with and without the last request.
         self._reported = self._reported_before = (0, 0)
 
-    def add(self, *, in_time: bool, age_ms: float | None = None) -> None:
+    def add(self, *, in_time: bool, age_ms: float | None = None, is_careful: bool = False) -> None:
         """Count a tick at which an action of the policy was due.
 
         Args:
             in_time: Whether an answer had a row for it.
             age_ms: The age of the tick's executed action, ms; None if no action was executed.
+            is_careful: Whether the robot waited by choice before it moves a gripper.
         """
         self.ticks += 1
+        self.careful += is_careful
         if not in_time:
             self.starved += 1
         elif age_ms is not None:
@@ -94,7 +98,8 @@ class Timeliness:
         """
         in_time = info.get(IN_TIME)
         if in_time is not None:
-            self.add(in_time=in_time, age_ms=info.get(AGE_MS))
+            is_careful = info.get(CAUSE) == "careful"
+            self.add(in_time=in_time, age_ms=info.get(AGE_MS), is_careful=is_careful)
 
     def count_missed(self, ticks: int) -> None:
         """Count ticks that passed while the loop was busy, for example while it waited for an

@@ -505,6 +505,8 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
     )
 
     _say_timeliness(report, say)
+    if report.careful:
+        say(f"ticks of waiting by choice before a gripper moves (fresh_grip): {report.careful}")
     if report.slow is not None:
         say(report.slow)
     elif report.rows_per_tick is not None:

@@ -372,6 +372,9 @@ class LoopReport:
     # The number of ticks at which the robot did not move because all rows were executed and the
     # next answer had not arrived.
     waiting: int = 0
+    # The number of ticks at which the robot waited by choice for a new answer, before it moves a
+    # gripper (see `PlayerSettings.fresh_grip`); `safe` does not count them.
+    careful: int = 0
     barks: list[str] = field(default_factory=list)  # reasons of stops by the watchdog or a command
     interventions: int = 0  # ticks at which an operator moved the robot
     # The number of ticks at which the robot was paused (see `vlagents_ray.chunking.control`);
@@ -387,8 +390,8 @@ class LoopReport:
 
     @property
     def safe_ticks(self) -> int:
-        """The number of ticks without an action of the policy: the sum of `waiting` and all counts
-        in `safe`.
+        """The number of ticks at which an action of the policy was missing: the sum of `waiting`
+        and all counts in `safe`.
         """
         return self.waiting + sum(self.safe.values())
 
@@ -451,6 +454,8 @@ class LoopReport:
         self.reasons.setdefault(hold.cause, hold.reason)
         if hold.cause == "paused":
             self.paused += 1
+        elif hold.cause == "careful":
+            self.careful += 1
         elif hold.cause == "waiting":
             self.waiting += 1
         else:

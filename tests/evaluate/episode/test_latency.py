@@ -202,6 +202,7 @@ AGAINST_THE_CONTRACT: dict[str, tuple[dict[str, Any], Contract, str] | str] = {
     "latency": "a time of the policy; the environment's rate converts it to ticks",
     "mode": ({"mode": "open_loop"}, ABSOLUTE, "zeros might command a motion"),
     "real_time_chunking": "a choice of the policy",
+    "fresh_grip": "a choice of the policy; without known grippers it has no effect",
     "neutral": ({"neutral": [0, 0, 0]}, ABSOLUTE, "2 numbers, as the environment's actions have"),
 }
 

@@ -440,7 +440,9 @@ class _Episode:
         stats.steps += 1
         stats.ticks_waited += tick.waited
         if stats.timeliness is not None:
-            stats.timeliness.add(in_time=not tick.starved, age_ms=tick.age_ms)
+            stats.timeliness.add(
+                in_time=not tick.starved, age_ms=tick.age_ms, is_careful=tick.careful
+            )
         stats.actions.update(tick.action.astype(_LITTLE_ENDIAN, copy=False).tobytes())
         return tick
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlagents_ray.chunking.buffer import ChunkBuffer, DelayEstimate
+from vlagents_ray.chunking.careful import CarefulRows
 from vlagents_ray.columns import Columns
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction
@@ -32,11 +33,12 @@ class Tick(NamedTuple):
 
     action: np.ndarray  # (D,) float32
     waited: bool = False  # whether it is executed while waiting for an answer
-    starved: bool = False  # whether the action is not a row of an answer
+    starved: bool = False  # whether the action is not a row of an answer, though one was due
     # Real-time mode: the time since the observation from which the action was computed, ms.
     age_ms: float | None = None
     # Whether the policy ends the episode after this tick, the last row of an answer with `done`.
     done: bool = False
+    careful: bool = False  # whether the robot waits by choice before it moves a gripper
 
 
 class ChunkExecutor:
@@ -90,6 +92,7 @@ class ChunkExecutor:
             _require_fit(self._clock.neutral, env.action)
 
         self._plan = ChunkBuffer(action=env.action)
+        self._careful = CarefulRows(self._plan, self._clock.fresh_grip)
         self._tick = 0  # the number of the next tick in real-time mode
         self._last = last  # the last action, (D,)
         self._delay = DelayEstimate()
@@ -105,7 +108,9 @@ class ChunkExecutor:
         """Return the `Obs.info` for real-time chunking, with the remaining rows; {} if no rows
         remain or real-time chunking is off.
         """
-        return self._plan.continuation(self._delay.ticks) if self._clock.real_time_chunking else {}
+        if not self._clock.real_time_chunking:
+            return {}
+        return self._plan.continuation(self._careful.rows_ahead(self._last, self._delay.ticks))
 
     def ticks(
         self,
@@ -151,18 +156,38 @@ class ChunkExecutor:
         # chunks would ever be executed.
         latest_start = self._plan.executed - len(rows) + 1
         start = max(executed_at_request, latest_start)
-        self._plan.replace(rows, start, observed, origin)
-        if self._clock.mode == "async" and execute is not None and ticks_waited >= execute:
-            return  # The next request is due at this tick, as in the chunk player.
-        end = len(rows) if execute is None else min(execute, len(rows))
-        is_last = False
-        while not is_last:
+        awaited = self._careful.awaited(self._last, self._delay.ticks)
+        self._plan.replace(rows, start, observed, origin, done=done)
+        self._careful.answered(awaited)
+
+        # The next request is due after `execute` rows, or in "async" after as many ticks, as in the
+        # chunk player.
+        is_due = False
+        if self._clock.mode == "async" and execute is not None:
+            is_due = ticks_waited >= execute
+        while not is_due and not self._stands():
             step = self._plan.take()
-            is_last = step.row >= end - 1
-            yield self._executed(step.action, observed)._replace(done=done and is_last)
+            tick = self._executed(step.action, observed)
+            executed = step.row + 1
+            if execute is not None:
+                is_due = execute <= (
+                    self._tick - observed if self._clock.mode == "async" else executed
+                )
+            is_due = is_due or executed == len(rows)
+            yield tick._replace(done=done and is_due)
+
+    def _stands(self) -> bool:
+        """Return whether the robot waits for a new answer before it moves a gripper."""
+        is_async = self._clock.mode == "async"
+        return is_async and self._careful.stands(self._last, self._delay.ticks)
 
     def _waiting(self, ticks: int, dim: int) -> Iterator[Tick]:
         for _ in range(ticks):
+            if self._stands():
+                tick = self._executed(self._held(dim), None, waited=True)
+                yield tick._replace(starved=False, careful=True)
+                continue
+
             step = self._plan.next if self._clock.mode == "async" else None
             if step is None:
                 action = self._held(dim)
@@ -184,6 +209,7 @@ class ChunkExecutor:
         age_ms = None if observed is None else 1e3 * (self._tick - observed) / self._hz
         self._tick += 1
         self._last = action
+        self._careful.executed(action)
         return Tick(action, waited, observed is None, age_ms)
 
     def _held(self, dim: int) -> np.ndarray:

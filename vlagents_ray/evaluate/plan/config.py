@@ -33,6 +33,7 @@ from vlagents_ray.bounds import (
     MOST_STEPS_NAMED,
     MOST_WORKERS,
 )
+from vlagents_ray.chunking.careful import FRESH_GRIP
 from vlagents_ray.chunking.choice import Choice, ChosenMode
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
@@ -235,6 +236,12 @@ class ClockConfig(_PlanModel):
         default=False,
         description="Send the policy the remaining rows of the last chunk, and the number of "
         "ticks of the delay. Requires `mode: async`.",
+    )
+    fresh_grip: Annotated[int, Field(ge=1)] | None = Field(
+        default=FRESH_GRIP,
+        description="Age in rows from which the observation of a row is too old to open or close a "
+        "gripper: the robot stands and waits for a new answer. It has an effect if answers are as "
+        "late. null: the robot never waits.",
     )
     neutral: list[FiniteFloat] | None = Field(
         default=None,
