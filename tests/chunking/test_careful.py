@@ -123,8 +123,8 @@ def in_evaluation(spec: ActionSpec, delay: int, **settings: Any) -> tuple[Arm, i
     neutral = [0.0, 1.0] * ((spec.dim or 0) // 2)
     clock = ClockConfig(latency=delay / 10, neutral=neutral, **settings)
     policy, arm, careful = Grasping(spec), Arm(spec), 0
-    executor = ChunkExecutor(4, clock, Contract(action=spec, control_hz=10.0))
-    for _ in range(20):
+    executor = ChunkExecutor(2, clock, Contract(action=spec, control_hz=10.0))
+    for _ in range(40):
         answer = policy.act(arm.observe())
         for tick in executor.ticks(answer.action, delay / 10):
             arm.apply(tick.action)

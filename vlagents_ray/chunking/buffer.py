@@ -522,15 +522,16 @@ class ChunkBuffer:
 
         Args:
             action: The action, (D,).
-            row: The row of the newest chunk, (D,). Its numbers beyond the limits are not corrected,
-                so that the guard rejects them.
+            row: The row of the newest chunk, (D,). Its numbers beyond the bounds of the guard are
+                not corrected, so that the guard rejects them.
         """
         columns = self._set_columns(len(row))
         low = np.where(np.isfinite(self._least), self._least, -self._reach)
         high = np.where(np.isfinite(self._most), self._most, self._reach)
         limited = columns.limited(action, low, high)
-        is_beyond = (row < self._least) | (row > self._most)
-        limited[is_beyond] = row[is_beyond]
+        if any(bound is not None for bound in self._guard_bounds):
+            is_beyond = (row < self._least) | (row > self._most)
+            limited[is_beyond] = row[is_beyond]
         return limited
 
     def _update(self, planned: _Planned) -> None:

@@ -160,21 +160,15 @@ class ChunkExecutor:
         self._plan.replace(rows, start, observed, origin, done=done)
         self._careful.answered(awaited)
 
-        # The next request is due after `execute` rows, or in "async" after as many ticks, as in the
-        # chunk player.
-        is_due = False
-        if self._clock.mode == "async" and execute is not None:
-            is_due = ticks_waited >= execute
-        while not is_due and not self._stands():
+        if self._clock.mode == "async" and execute is not None and ticks_waited >= execute:
+            return  # The next request is due at this tick, as in the chunk player.
+
+        end = len(rows) if execute is None else min(execute, len(rows))
+        is_last = False
+        while not is_last and not self._stands():
             step = self._plan.take()
-            tick = self._executed(step.action, observed)
-            executed = step.row + 1
-            if execute is not None:
-                is_due = execute <= (
-                    self._tick - observed if self._clock.mode == "async" else executed
-                )
-            is_due = is_due or executed == len(rows)
-            yield tick._replace(done=done and is_due)
+            is_last = step.row >= end - 1
+            yield self._executed(step.action, observed)._replace(done=done and is_last)
 
     def _stands(self) -> bool:
         """Return whether the robot waits for a new answer before it moves a gripper."""
