@@ -98,6 +98,39 @@ def test_a_player_reports_the_delay_of_each_answer(monkeypatch: pytest.MonkeyPat
     assert figures["late"] > 0
 
 
+class Grasping(Agent):
+    """A policy whose answers take 0.15 s, and open or close the gripper in turn at row 5."""
+
+    contract = Contract(
+        action=ActionSpec(dim=7, delta=True, gripper_open=1.0, gripper_closed=0.0), chunk=8
+    )
+
+    def __init__(self) -> None:
+        self.answers = 0
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(0.15)
+        self.answers += 1
+        rows = np.zeros((8, 7), np.float32)
+        rows[:5, -1] = self.answers % 2
+        rows[5:, -1] = (self.answers + 1) % 2
+        return Act(rows)
+
+
+def test_a_robot_that_stands_before_it_moves_a_gripper_waits_by_choice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At 20 Hz, an answer takes three ticks, so that the observation of each grip is too old."""
+    monkeypatch.setattr(robot_process, "connect", lambda _: Grasping())
+    with contextlib.closing(RunningRobot(Robot("", OURS, 20.0, 8, 8))) as robot:
+        begin = time.monotonic()
+        figures = robot.run(begin, begin + 0.5, begin + 3.0)
+    assert figures["waits"], figures
+    assert figures["ticks"] == pytest.approx(
+        len(figures["ages"]) + figures["late"] + sum(figures["waits"])
+    )
+
+
 @pytest.mark.parametrize("loop", LOOPS)
 def test_the_figures_of_a_robot_survive_their_way_between_processes(
     monkeypatch: pytest.MonkeyPatch, loop: Loop
