@@ -132,8 +132,7 @@ def test_an_episode_beside_others_is_replayed_to_the_bit(folder: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
     results = Results.load(folder / "runs" / "runs")
-    # Three environments act together, and a pass has the next power of two.
-    assert results.policies["reference"]["passes"] == {"invariant": True, "rows": 4}
+    assert results.policies["reference"]["passes"] == {"invariant": True, "rows": 8}
     for number in (1, 4):
         command = [*POISON, "replay", "runs/runs", f"tabletop#{number}"]
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
@@ -152,7 +151,8 @@ def _batch(sessions: int, rows: int | None = None, **batch: object) -> dict[str,
 
 def test_an_evaluation_pads_its_full_batches() -> None:
     assert _batch(1) == {"max_size": 16, "invariant": False}
-    assert _batch(5) == {"max_size": 8, "invariant": "auto"}
+    assert _batch(2) == {"max_size": 8, "invariant": "auto"}
+    assert _batch(9) == {"max_size": 16, "invariant": "auto"}
     assert _batch(100) == {"max_size": 16, "invariant": "auto"}
     assert _batch(100, max_size=2) == {"max_size": 2, "invariant": "auto"}
     # What the file says of it is kept.

@@ -53,6 +53,9 @@ from vlagents_ray.serve.local_agent import LocalPolicy
 
 Agents = Mapping[str, Callable[..., Agent]]  # policies that run in this process, by name
 _STARTING_S = 30.0  # time limit for a server at a URL
+# In passes of 2 or 4 rows on a CPU, the places of LeRobot's ACT, Diffusion and VQ-BeT differ in
+# their last bits; in passes of 8 and 16 rows, those of no measured policy do.
+_LEAST_ROWS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,8 +154,9 @@ def with_full_passes(deployment: Deployment, sessions: int, rows: int | None = N
     Args:
         deployment: The deployment of a policy.
         sessions: The number of episodes that act at the same time. The passes have as many rows,
-            rounded up to a power of two, and at most `batch.max_size`. With 1, the deployment is
-            not changed, nor if its file sets `batch.invariant` or `batch.sizes`.
+            rounded up to a power of two, at least `_LEAST_ROWS`, and at most `batch.max_size`. With
+            1, the deployment is not changed, nor if its file sets `batch.invariant` or
+            `batch.sizes`.
         rows: The number of rows of each pass of a recorded evaluation, which applies in any case.
     """
     changed = deployment.model_copy(deep=True)
@@ -165,7 +169,7 @@ def with_full_passes(deployment: Deployment, sessions: int, rows: int | None = N
                 "invariant": True,
             }
         elif sessions > 1 and not batch.model_fields_set & {"invariant", "sizes"}:
-            size = min(batch.max_size, 2 ** (sessions - 1).bit_length())
+            size = min(batch.max_size, max(_LEAST_ROWS, 2 ** (sessions - 1).bit_length()))
             settings = app.args.get("batch") or {}
             app.args["batch"] = {**settings, "max_size": size, "invariant": "auto"}
     return changed

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from batch_bits import differing_acts, invariant
 from pushed_weights import check_pushed_weights
 from shared_readings import check_shared_readings
 
@@ -50,6 +51,27 @@ def test_a_session_gets_the_same_in_any_company(kind: str, loaded: Load) -> None
             )
             assert isinstance(acts[0], Act)
             np.testing.assert_allclose(acts[0].action, expected, atol=ATOL)
+
+
+@pytest.mark.verifies("batches")
+@pytest.mark.parametrize("kind", sorted(tiny.KINDS))
+def test_no_bit_depends_on_the_batch_where_passes_have_one_size(kind: str, made: Made) -> None:
+    with invariant(16) as report:
+        policy = LeRobot.from_config({"checkpoint": str(made(kind))})
+        policy.initialize()
+    if report.variation is not None:  # a server rejects this policy
+        assert report.variation == policy.variation
+        return
+
+    compared, differing = differing_acts(
+        policy,
+        lambda robot: begun(policy, robot),
+        lambda robot, tick: view(100 * tick + robot),
+        ticks=2,
+        rounds=2,
+    )
+    assert compared == 2 * 2 * 11
+    assert differing == []
 
 
 @pytest.mark.parametrize("kind", INSTRUCTED)

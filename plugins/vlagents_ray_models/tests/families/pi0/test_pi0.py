@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from batch_bits import differing_acts, invariant
 from safetensors.torch import load_file, save_file
 
 from plugins.vlagents_ray_models.tests.families.pi0 import tiny
@@ -21,7 +22,7 @@ from plugins.vlagents_ray_models.tests.families.pi0.conftest import (
 )
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotTrainable
-from vlagents_ray.interface import DELAY, LEFTOVER
+from vlagents_ray.interface import DELAY, LEFTOVER, SAMPLES
 from vlagents_ray.testing import check_agent
 from vlagents_ray_models.pi0 import Pi0
 
@@ -122,6 +123,27 @@ def test_chunks_follow_the_plan(loaded: Pi0) -> None:
     assert (off[:3] < 0.1 * without[:3]).all()
     assert (off[3:] < without[3:]).all()
     assert off[3] < off[-1]  # it follows closely at first, loosely at the end
+
+
+@pytest.mark.verifies("batches")
+@pytest.mark.parametrize("noise_level", [0.0, 0.5])
+def test_no_bit_depends_on_the_batch_where_passes_have_one_size(
+    folder: Path, noise_level: float
+) -> None:
+    with invariant(8) as report:
+        policy = made(folder, noise_level=noise_level)
+    assert report.variation is None
+
+    def observe(robot: int, tick: int) -> Obs:
+        plan = np.ones((6, tiny.ACTION_DIM), np.float32)
+        info = [{}, {LEFTOVER: plan, DELAY: 2}, {SAMPLES: 1}][(robot + tick) % 3]
+        return seen(100 * tick + robot, (120 + robot, 160), **info)
+
+    compared, differing = differing_acts(
+        policy, lambda robot: begun(policy, robot), observe, ticks=2, rounds=2
+    )
+    assert compared == 2 * 2 * 11
+    assert differing == []
 
 
 @pytest.mark.verifies("isolation")
