@@ -263,6 +263,9 @@ class ClockConfig(_PlanModel):
         Args:
             execute: The `execute` of the policy's settings.
             hz: The rate of the environment, 1/s.
+
+        Returns:
+            The arguments by name.
         """
         return {
             "mode": self.mode,
@@ -273,7 +276,14 @@ class ClockConfig(_PlanModel):
         }
 
     def chosen(self, choice: Choice) -> ClockConfig:
-        """Return this clock with the chosen mode in place of `auto`."""
+        """Return this clock with the chosen mode in place of `auto`.
+
+        Args:
+            choice: The mode that was chosen with the arguments of `choice`.
+
+        Returns:
+            The clock.
+        """
         chunking = choice.settings.real_time_chunking
         return self.model_copy(update={"mode": choice.mode, "real_time_chunking": chunking})
 
