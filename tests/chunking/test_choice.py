@@ -117,6 +117,13 @@ def test_the_robot_runs_as_the_measured_one_did() -> None:
     assert "10 % of 100" in chosen(contract(), 3, curves=curves, execute=2, horizon=6).line
 
 
+def test_success_without_careful_rows_is_not_that_of_the_default() -> None:
+    curves = [curve({0: 98, 3: 82}, fresh_grip=None), curve({0: 98, 3: 95})]
+    assert chosen(contract(), 3, curves=curves).line.endswith("95 % of 100 at 3 rows, tabletop")
+    at_once = chosen(contract(), 3, curves=curves, fresh_grip=None)
+    assert at_once.line.endswith("82 % of 100 at 3 rows, tabletop")
+
+
 @pytest.mark.parametrize(
     ("curves", "prefix", "rows", "is_with_prefixes"),
     [
@@ -183,7 +190,7 @@ SETTINGS = st.fixed_dictionaries(
 )
 
 
-NAMES = ["execute", "horizon", "merge", "real_time_chunking", "mode", "x"]
+NAMES = ["execute", "horizon", "merge", "real_time_chunking", "fresh_grip", "mode", "x"]
 VALUES = st.none() | st.booleans() | st.integers(-1, 3) | st.floats(0, 2) | st.text(max_size=1)
 
 
@@ -261,7 +268,7 @@ def test_a_curve_is_named_only_if_the_robot_runs_with_its_settings(
     curves: list[SuccessCurve], rows: int
 ) -> None:
     choice = chosen(contract(chunk=60), rows, curves=curves)
-    names = {"execute", "real_time_chunking", "horizon", "merge"}
+    names = {"execute", "real_time_chunking", "horizon", "merge", "fresh_grip"}
     defaults = {field.name: field.default for field in fields(PlayerSettings)}
     matching = [
         one

@@ -273,6 +273,7 @@ class ClockConfig(_PlanModel):
             "delay_s": self.latency if isinstance(self.latency, (int, float)) else None,
             "execute": execute,
             "real_time_chunking": self.real_time_chunking,
+            "fresh_grip": self.fresh_grip,
         }
 
     def chosen(self, choice: Choice) -> ClockConfig:
