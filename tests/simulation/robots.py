@@ -341,7 +341,8 @@ class World:
             self.at(
                 arrives, lambda pending=pending, replan_s=replan_s: self._answer(pending, replan_s)
             )
-        self.pace.update()
+        if self.pace.robots:
+            self.pace.load()
         self._turn()
 
     def _answer(self, pending: PendingRequest, replan_s: float) -> None:

@@ -152,14 +152,6 @@ class Session(Generic[M]):
         """Return whether an act or a close belongs to the session's current episode."""
         return pending.belongs_to(self.first, self.steps, self.began)
 
-    def require_episode_of(self, pending: PendingRequest) -> None:
-        """Raise an error unless an act can be executed in the session's current episode."""
-        if self.agent is None:
-            raise NotReset(f"session {self.id!r}: its last reset failed; reset again")
-        if not pending.belongs_to(self.first, self.steps, self.began):
-            step = pending.request.step
-            raise self.wrong_episode() if step is None else self.wrong_step(step)
-
     def add_report(self, report: RobotReport, now: float) -> None:
         """Add the report of the session's robot that arrived at `now`, s."""
         if self.times is None:
@@ -368,18 +360,22 @@ class SessionTable(Generic[M]):
             session.begin(opening)
             return session
 
-    def use(self, session: Session[M], origin: Origin) -> None:
-        """Record that the policy's thread executes a request of `origin` in the session.
+    def use(self, session: Session[M], pending: PendingRequest) -> None:
+        """Record that the policy's thread executes an act in the session's current episode.
 
         Raises:
-            ConnectionLost: The connection of the request has ended.
+            UnknownSession: The act belongs to another episode, or to another step.
+            ConnectionLost: The connection of the act has ended.
         """
-        session.used = time.monotonic()
-        if not origin.owner:
-            session.origin = origin  # there is no connection whose end could end the session
-        elif session.origin is not origin or origin.sessions.get(session.id) != session.first:
+        origin, step = pending.origin, pending.request.step
+        # Most acts follow an act, or the reset, of the same connection and episode.
+        follows = session.origin is origin and pending.episode == session.first
+        if not follows or step not in (None, session.steps):
+            if not session.has_episode_of(pending):
+                raise session.wrong_episode() if step is None else session.wrong_step(step)
             with self._lock:
                 self._own(session, origin, session.first)
+        session.used = time.monotonic()
 
     def _own(self, session: Session[M], origin: Origin, first: int) -> None:
         """Let the session belong to the connection of `origin`, in the episode that begins at the

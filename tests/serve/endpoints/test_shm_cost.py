@@ -28,9 +28,7 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 
 ACTS = 50
-# Of these, seven follow from sessions that change only when a request is executed, and from requests
-# that are held for robots: about 0.5 us together.
-MOST_CALLS = 90
+MOST_CALLS = 82
 OBS = Obs({"front": np.zeros((64, 64, 3), np.uint8)}, 0.5, {"joints": np.zeros(7, np.float32)})
 # Functions whose number of calls depends on the elapsed time.
 POLLING = ("_wait_for_request", "_wait_for_event", "poll", "mark_idle", "mark_busy")

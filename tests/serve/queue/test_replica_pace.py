@@ -240,5 +240,5 @@ def test_the_room_of_robots_that_have_left_is_free_after_the_next_batch() -> Non
     assert robots.queue.room is not None
     robots.plans = []
     robots.now += 1.0
-    robots.pace.update()
+    robots.pace.load()
     assert robots.queue.room is None

@@ -231,7 +231,8 @@ class Runner:
             self._intake.fail(pending, _not_taken(pending, self._clock()))
         if not taken.batch:
             self._sessions.drop_idle()
-            self._pace.update()
+            if self._pace.robots:
+                self._pace.load()
             return
         self._queue.begin(taken.batch)
         try:
@@ -246,7 +247,8 @@ class Runner:
                 failed = PolicyFailed(f"the policy raised {type(error).__name__}")
                 self._intake.fail(pending, failed)
         self._queue.end()
-        self._pace.update()
+        if self._pace.robots:
+            self._pace.load()
 
     def _run(self, batch: Sequence[PendingRequest]) -> None:
         acting: dict[tuple[LoadedModel, WeightsVersion], list[Acting]] = {}
@@ -363,13 +365,14 @@ class Runner:
         else:
             session = reserved.session
         model, weights = session.model, session.weights
-        session.require_episode_of(pending)
+        if session.agent is None:
+            raise NotReset(f"session {session.id!r}: its last reset failed; reset again")
         if model is None or weights is None:
             raise UnknownSession(f"session {pending.session_id!r}: has just been closed; reset it")
         # The session has arrived since the act was compared with the contract.
         if reserved is None or model is not reserved.model:
             model.check(pending.request)
-        self._sessions.use(session, pending.origin)
+        self._sessions.use(session, pending)
         if pending.message.reports and pending.index in pending.message.reports:
             # The measured success is that of the loaded checkpoint.
             tolerated_age_ms = None if weights.number else model.tolerated_age_ms
@@ -424,8 +427,10 @@ class Runner:
         """Compute the acts of sessions that use the same model and version of its weights, and
         return the answers that are due now.
         """
-        observations = [pending.request.obs for pending, _ in acting]
-        agents = [session.agent for _, session in acting]
+        observations, agents = [], []
+        for pending, session in acting:
+            observations.append(pending.request.obs)
+            agents.append(session.agent)
         padding = 0
         if self._batch_sizes:
             with model.busy, model.uncaptured:

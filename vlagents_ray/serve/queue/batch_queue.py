@@ -282,27 +282,23 @@ class BatchQueue:
         """Poll the watched files until a request waits that is not held, or the queue is closed;
         return False after `idle_s` without events, or soon if requests are held.
         """
+        had_event: bool | None = None  # None before the first wait
         while True:
             with self._lock:
                 # Without robots, nothing is held; each function call here delays every act.
                 waiting = self._waiting
                 is_held = waiting.room is not None and waiting.is_held(self._clock())
                 must_return = self._closed or self._interrupted
-                ready = must_return or (waiting.size > 0 and not is_held)
-                self._asleep = not ready
-            had_event = self.poller.poll(0.0) if ready else self._wait_for_event(is_held)
-            self._asleep = False
-            if ready:
+                is_ready = must_return or (waiting.size > 0 and not is_held)
+                self._asleep = not is_ready and had_event is not False
+            if is_ready:
+                if had_event is None:
+                    self.poller.poll(0.0)  # for requests that belong in the same batch
                 return True
-            with self._lock:
-                if self._is_ready(self._waiting.is_held(self._clock())):
-                    return True
-            if not had_event:
+            if had_event is False:
                 return False
-
-    def _is_ready(self, is_held: bool) -> bool:
-        """Return whether `next` must return. The caller holds the lock."""
-        return self._closed or self._interrupted or (self._waiting.size > 0 and not is_held)
+            had_event = self._wait_for_event(is_held)
+            self._asleep = False
 
     def _wait_for_event(self, is_held: bool) -> bool:
         """Wait for a watched file or a wake-up call; return False if there was none within

@@ -179,19 +179,13 @@ class ReplicaPace:
     ) -> None:
         self._queue, self._plans, self._clock = queue, plans, clock
         self._load = IDLE  # load of the robots that are served first
-        self._robots = 0  # number of robots that send their slack
+        # Number of robots that send their slack. While there are some, `load` must be called after
+        # each batch and idle time; otherwise the last robot that leaves would keep its room.
+        self.robots = 0
         self._others = 0  # number of robots that wait behind others
         self._throughput_hz = math.inf  # maximum number of answers per second
         self._read = -math.inf  # time at which the needs were read, s
         self._reread_s = _FIRST_READ_S  # time after which the needs are read again, s
-
-    def update(self) -> None:
-        """Read the needs of the robots again if there were robots, after a batch or an idle time.
-
-        Otherwise the last robot that leaves would keep its room.
-        """
-        if self._robots:
-            self.load()
 
     def load(self) -> RobotsLoad:
         """Return the load of the robots that are served first, which is at most half a second
@@ -219,13 +213,14 @@ class ReplicaPace:
         load = self.load()
         need, now = plan.need, self._clock()
         # A request that is sent before the waiting requests are answered would have to wait.
-        waiting_s = self._queue.depth_first() / self._throughput_hz
+        waiting = self._queue.depth_first()
+        waiting_s = waiting / self._throughput_hz
         waited_s = now - plan.asked
         if need is None:
             # If many robots begin at the same time, they are answered one after the other. Their
             # next requests keep these distances.
-            return waiting_s if self._robots < 2 else waiting_s + waited_s
-        if self._robots < 2:
+            return waiting_s if self.robots < 2 else waiting_s + waited_s
+        if self.robots < 2:
             return 0.0
         if plan.waits_behind_others:
             # An answer is most useful if all earlier rows have been executed.
@@ -233,7 +228,11 @@ class ReplicaPace:
 
         # If several robots sent requests at the same time, the robot that is answered first sends
         # its next request first. Their next requests then do not arrive at the same time again.
-        earlier_s = (waiting_s - max(0.0, waited_s - load.latency_s)) / 2
+        # Robots that wait behind others need the places in batches that earlier requests take, so
+        # that many of these requests do not count. With 5 % too many robots with 50 rows, 444 of
+        # 445 are in time, and 430 if all requests count.
+        ahead_s = max(0, waiting - self._others) / self._throughput_hz
+        earlier_s = (ahead_s - max(0.0, waited_s - load.latency_s)) / 2
         backlog_s = now - plan.begins + waiting_s
         longest_s = need.interval_s(load.latency_s)
         interval_s = min(longest_s, max(backlog_s, load.replan_s(need) - earlier_s))
@@ -257,7 +256,7 @@ class ReplicaPace:
                 plan.waits_behind_others = False
         plans.sort(key=lambda plan: (plan.need is None, plan.began))
         known = Counter(plan.need for plan in plans if plan.need is not None)
-        self._robots, self._others = len(plans), 0
+        self.robots, self._others = len(plans), 0
         self._load, self._queue.room = IDLE, None
         had_others = self._queue.had_others()
         curve = self._queue.curve()
