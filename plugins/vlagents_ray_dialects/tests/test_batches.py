@@ -106,8 +106,10 @@ def over_sglang(client: Any, *, named: bool) -> ActOnAll:
         response = client.post(PATH, content=openpi.encode(payload), headers=MSGPACK)
         if response.status_code != 200:
             raise Refused(response.text)
-        values = [entry["action"]["values"] for entry in openpi.decode(response.content)["data"]]
-        return [int(value) for value in np.concatenate([np.ravel(value) for value in values])]
+        actions: list[int] = []
+        for entry in openpi.decode(response.content)["data"]:
+            actions += map(int, np.ravel(entry["action"]["values"]))
+        return actions
 
     return act
 

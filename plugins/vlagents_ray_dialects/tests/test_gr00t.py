@@ -81,12 +81,12 @@ def test_a_fortran_array_and_text_arrays_are_read() -> None:
 
 def test_observations_of_a_batch_are_taken_apart_and_actions_joined() -> None:
     asked = gr00t_codec.read_observations(
-        {"observation": nested(3, 2, [["a"], ["b"], ["c"]]), "options": None}
+        {"observation": nested(3, 1, [["a"], ["b"], ["c"]]), "options": None}
     )
     assert (len(asked.each), asked.batched, asked.flat, asked.paired) == (3, True, False, True)
-    last = [gr00t_codec.newest(one) for one in asked.each]
-    assert [int(one["video"]["ego"].max()) for one in last] == [1, 3, 5]
-    assert [one["state"]["arm"].tolist() for one in last] == [[1, 1], [3, 3], [5, 5]]
+    last = [gr00t_codec.at_its_time_step(one) for one in asked.each]
+    assert [int(one["video"]["ego"].max()) for one in last] == [0, 1, 2]
+    assert [one["state"]["arm"].tolist() for one in last] == [[0, 0], [1, 1], [2, 2]]
     assert [one["language"] for one in last] == [{"task": "a"}, {"task": "b"}, {"task": "c"}]
     action, info = gr00t_codec.write_actions(
         [{"arm": np.full((4, 2), i)} for i in range(3)], asked, {"done": []}
@@ -105,7 +105,7 @@ def test_n1_5_sends_flat_keys_and_gets_the_actions_alone(batched: bool) -> None:
     }
     asked = gr00t_codec.read_observations(data)
     assert (asked.batched, asked.flat, asked.paired) == (batched, True, False)
-    assert gr00t_codec.newest(asked.each[0])["language"] == {"task": "go"}
+    assert gr00t_codec.at_its_time_step(asked.each[0])["language"] == {"task": "go"}
     answer = gr00t_codec.write_actions([{"arm": np.zeros((4, 2))}], asked, {})
     assert answer["action.arm"].shape == ((1, 4, 2) if batched else (4, 2))
 
@@ -120,6 +120,10 @@ def test_n1_5_sends_flat_keys_and_gets_the_actions_alone(batched: bool) -> None:
             "state": {"arm": np.zeros((2, 1, 2))},
         },
         {"video": {"ego": np.zeros((1, 0, 4, 6, 3), np.uint8)}},
+        nested(1, 3),
+        nested(2, 2),
+        nested() | {"state": {"arm": np.zeros((1, 2, 2), np.float32)}},
+        nested() | {"language": {"task": [["go", "stop"]]}},
         {"video": {"ego": "x"}},
         {"video": {"ego": np.zeros((0, 1, 4, 6, 3), np.uint8)}},
         {"video": [], "state": {"arm": np.zeros((1, 1, 2))}},

@@ -342,7 +342,7 @@ def arrive(sent: Sent, change: Callable[[str], str] = str) -> tuple[Obs, str | N
     if not sent.preset.startswith("gr00t"):
         return mapping.obs(renamed(sent.observation, change))
     [one] = gr00t_codec.read_observations(sent.observation).each
-    return nested_mapping(mapping)[0].obs(renamed(gr00t_codec.newest(one), change))
+    return nested_mapping(mapping)[0].obs(renamed(gr00t_codec.at_its_time_step(one), change))
 
 
 def renamed(nested: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:

@@ -112,9 +112,12 @@ def test_the_error_of_an_image_names_its_camera() -> None:
         act({"obs": {"arm": robot}})
 
 
-def test_of_several_frames_the_last_is_taken() -> None:
+def test_several_frames_are_refused_and_a_single_one_may_have_a_time_axis() -> None:
     frames = np.stack([np.full((4, 4, 3), i, np.uint8) for i in range(3)])
-    assert act({"obs": {"arm": {"cameras": {"a": frames}}}}).obs.cameras["a"].max() == 2
+    assert act({"obs": {"arm": {"cameras": {"a": frames[2:]}}}}).obs.cameras["a"].max() == 2
+    for several in (frames, frames[:2], frames[:0]):
+        with pytest.raises(InvalidObservation, match="camera 'a': expected one frame, got"):
+            act({"obs": {"arm": {"cameras": {"a": several}}}})
 
 
 def test_a_reset_of_0_2_brings_instruction_and_options() -> None:

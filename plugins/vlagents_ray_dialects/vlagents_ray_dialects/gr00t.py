@@ -393,12 +393,13 @@ class GR00TConnection(GatewayClient):
         observations = []
         instructions = []
         for theirs in batch.each:
-            obs, instruction = mapping.obs(gr00t.newest(theirs), self._context.limits, contract)
+            single = gr00t.at_its_time_step(theirs)
+            obs, instruction = mapping.obs(single, self._context.limits, contract)
             observations.append(obs)
             instructions.append(instruction)
 
         if not self.sessions.begun:
-            mapping.warn_of_unread_cameras(gr00t.newest(batch.each[0]), "gr00t")
+            mapping.warn_of_unread_cameras(gr00t.at_its_time_step(batch.each[0]), "gr00t")
         acts = self.sessions.act_batch(charge, observations, instructions)
 
         spec = None if contract is None else contract.action
@@ -458,7 +459,7 @@ def _client_names(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> 
 
 
 def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
-    """Convert the keys of a mapping to the nested keys that `gr00t.newest` returns.
+    """Convert the keys of a mapping to the nested keys that `gr00t.at_its_time_step` returns.
 
     Args:
         mapping: The mapping, whose keys may be flat as in N1.5, such as `video.front`.

@@ -189,8 +189,13 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
 
     number = sizes.pop()
     texts = _texts(by_modality.get("language"), number)
-    if any(array.shape[1] == 0 for array in arrays):
-        raise InvalidObservation("observation: expected at least one moment, got none (T = 0)")
+    # Earlier moments are not dropped silently: a policy would act on less than its client believes.
+    moments = {array.shape[1] for array in arrays}
+    if moments != {1}:
+        raise InvalidObservation(
+            "observation: expected one time step (T = 1), as the modalities say, got "
+            f"T = {sorted(moments)}; send the newest frame and state"
+        )
 
     each = []
     for i in range(number):
@@ -221,15 +226,15 @@ def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
     return by_modality
 
 
-def newest(observation: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an observation's last time step: {"video": {name: (H, W, 3)}, "state": {name:
+def at_its_time_step(observation: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an observation at its only time step: {"video": {name: (H, W, 3)}, "state": {name:
     (D,)}, "language": ...}.
     """
-    last_step: dict[str, Any] = {}
+    time_step: dict[str, Any] = {}
     for modality in _ARRAY_MODALITIES:
-        last_step[modality] = {name: array[-1] for name, array in observation[modality].items()}
-    last_step["language"] = observation["language"]
-    return last_step
+        time_step[modality] = {name: array[0] for name, array in observation[modality].items()}
+    time_step["language"] = observation["language"]
+    return time_step
 
 
 def write_actions(
@@ -358,9 +363,11 @@ def _texts(language: Any, number: int) -> list[str | None]:
 
 
 def _text(key: Any, value: Any) -> str:
-    """Return an instruction; for a list over time, return the newest instruction."""
-    while isinstance(value, list) and value:
-        value = value[-1]
+    """Return an instruction, which may be in lists of one text."""
+    while isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, list):
+        raise InvalidObservation(f"{shown(key)}: expected one instruction, got {len(value)}")
     if not isinstance(value, str):
         raise InvalidObservation(f"{shown(key)}: expected text, got {type(value).__name__}")
     return value

@@ -302,8 +302,12 @@ def _image(
             f"camera_data_type: expected {RAW!r}, {JPEG!r} or {SHARED!r}, got {shown(image_format)}"
         )
 
-    if frame.ndim == 4 and len(frame):
-        frame = frame[-1]
+    if frame.ndim == 4 and len(frame) == 1:
+        frame = frame[0]
+    if frame.ndim == 4:
+        raise InvalidObservation(
+            f"camera {name[:40]!r}: expected one frame, got {len(frame)}; send the newest one"
+        )
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise InvalidObservation(
             f"camera {name[:40]!r}: expected (H, W, 3) uint8 RGB, got {frame.shape} {frame.dtype}"
