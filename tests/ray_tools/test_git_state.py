@@ -61,6 +61,29 @@ def test_what_differs_from_the_commit_is_kept_with_its_digest(repository: Path) 
     assert found.diff_sha256 == hashlib.sha256(found.diff).hexdigest()
 
 
+def test_a_package_is_its_folder_alone_and_a_module_its_repository(repository: Path) -> None:
+    package = repository / "lifting"
+    package.mkdir()
+    (package / "__init__.py").write_text("SPEED = 1\n")
+    git(repository, "add", ".")
+    git(repository, "commit", "--quiet", "--message", "add a package")
+    of_the_package = git(repository, "rev-parse", "HEAD")
+    (repository / "grasping.py").write_text("SPEED = 2\n")
+    git(repository, "commit", "--quiet", "--all", "--message", "change a module")
+    (repository / "grasping.py").write_text("SPEED = 3\n")
+    state = code_of("lifting")
+    assert (state.commit, state.diff_sha256) == (of_the_package, None)
+    assert code_of("grasping").commit == git(repository, "rev-parse", "HEAD")
+    assert b"+SPEED = 3" in code_of("lifting:Lifting").diff
+
+    git_state._code.cache_clear()
+    (package / "__init__.py").write_text("SPEED = 4\n")
+    changed = code_of("lifting")
+    assert changed.commit == of_the_package
+    assert b"+SPEED = 4" in changed.diff
+    assert b"+SPEED = 3" not in changed.diff
+
+
 def test_an_installed_module_inside_a_repository_is_not_taken_for_its_code(
     repository: Path,
 ) -> None:

@@ -18,9 +18,12 @@ _TIMEOUT_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class GitState:
-    """The state of a repository's tracked files; untracked files are not part of it."""
+    """The state of the tracked files of a repository, or of one of its folders; untracked files
+    are not part of it.
+    """
 
-    commit: str  # 40 hexadecimal digits
+    # 40 hexadecimal digits: the checked-out commit, or the last commit that changed the folder.
+    commit: str
     # Hash of the complete difference from the commit; None if there is no difference.
     diff_sha256: str | None
     diff: bytes  # output of `git diff`, truncated to `MOST_BYTES`
@@ -49,7 +52,9 @@ def code_of(target: str) -> GitState | None:
     """Return the state of the repository of "module" or "module:Class"; None if git does not track
     its file.
 
-    The module is located, but not imported.
+    A package without a class is its folder alone: an edit or a commit of other files in its
+    repository, such as tests and pages, does not change it. The module is located, but not
+    imported.
     """
     try:
         spec = importlib.util.find_spec(target.partition(":")[0])
@@ -61,7 +66,10 @@ def code_of(target: str) -> GitState | None:
     file = Path(spec.origin)
     # An installed package may be in a virtual environment within a repository that does not track
     # it.
-    return code_in(file.parent) if _is_tracked(file) else None
+    if not _is_tracked(file):
+        return None
+    is_package = spec.submodule_search_locations is not None
+    return _code(str(file.parent)) if is_package and ":" not in target else code_in(file.parent)
 
 
 @functools.cache
@@ -71,11 +79,14 @@ def _is_tracked(file: Path) -> bool:
 
 
 @functools.cache
-def _code(top: str) -> GitState | None:
-    """Return the state of the repository with this top folder, at the first call."""
-    commit = _git(Path(top), "rev-parse", "--verify", "HEAD")
-    diff = _git(Path(top), "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD")
-    if commit is None or diff is None:
+def _code(folder: str) -> GitState | None:
+    """Return the state of a folder in a repository, at the first call."""
+    is_top = _git(Path(folder), "rev-parse", "--show-prefix") == b"\n"
+    words = ("rev-parse", "--verify", "HEAD") if is_top else ("log", "-1", "--format=%H", "--", ".")
+    commit = _git(Path(folder), *words)
+    plain = ("--no-ext-diff", "--no-textconv", "--no-color")
+    diff = _git(Path(folder), "diff", *plain, "HEAD", "--", ".")
+    if not commit or diff is None:
         return None
     sha256 = hashlib.sha256(diff).hexdigest() if diff else None
     return GitState(commit.decode().strip(), sha256, diff[:MOST_BYTES])

@@ -11,7 +11,7 @@ from typing import Any
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.policies.base.program import Program
+from vlagents_ray.policies.base.program import SOFTWARE, Program
 from vlagents_ray.protocol.messages import Priority, Reply, Request
 from vlagents_ray.ray_tools.git_state import GitState
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -70,6 +70,10 @@ def policy_metadata(
         program: The digests of the policy's files, see `ServerArgs.code`.
     """
     contract, model = engine.contract, engine.model
+    software = model.software_elsewhere()
+    if software is not None:  # the policy has its own Python environment
+        files = {name: value for name, value in program.items() if not name.startswith(SOFTWARE)}
+        program = files | software
     return {
         "policy": args.policy,
         "checkpoint": model.checkpoint,

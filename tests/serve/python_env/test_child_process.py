@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -48,12 +49,15 @@ from vlagents_ray.errors import (
     UnknownSession,
     VLAgentsError,
 )
+from vlagents_ray.policies.base.program import SOFTWARE, software
 from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.policies.loading import loading_report
 from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.ability_call import is_method, name_of
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
+from vlagents_ray.serve.local_agent import policy_metadata
 from vlagents_ray.serve.models import served_model
 from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.serve.python_env.child_agent import ChildAgent
@@ -133,6 +137,24 @@ def info(reply: Reply) -> dict[str, Any]:
     found = reply.act.info if reply.act is not None else reply.info
     assert found is not None
     return found
+
+
+def test_the_software_of_the_policy_is_that_of_its_process(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = {f"{SOFTWARE}python": "version 3.10.1", f"{SOFTWARE}torch": "version 9.0"}
+    assert engine.model.software_elsewhere() == software()  # the same interpreter
+    policy = replace(engine.model.loaded.agent.child.policy, software=there)
+    monkeypatch.setattr(engine.model.loaded.agent.child, "policy", policy)
+    here = {
+        f"{SOFTWARE}python": "version 3.12.1",
+        f"{SOFTWARE}ray": "version 2",
+        "a.py": "sha256:1",
+    }
+    metadata = policy_metadata(ServerArgs(policy="noop"), engine, None, here)
+    programs = {name: metadata["program"][name] for name in (*there, "a.py")}
+    assert programs == {**there, "a.py": "sha256:1"}
+    assert f"{SOFTWARE}ray" not in metadata["program"]
 
 
 def test_the_steps_of_a_long_start_there_are_reported_here() -> None:

@@ -267,6 +267,10 @@ class ComputesElsewhere(ABC):
     def gpu_work(self) -> GpuWork:
         """Return the work of the other process on its GPUs since the last call."""
 
+    @abstractmethod
+    def software(self) -> Program:
+        """Return the software of the other process, see `policies.base.program.software`."""
+
 
 class ModelStats(Protocol):
     """Records the reports of models while they compute: the `MetricsBuffer` of an engine."""

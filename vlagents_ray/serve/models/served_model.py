@@ -231,6 +231,11 @@ class ServedModel:
         elsewhere = self._agent_elsewhere()
         return None if elsewhere is None else elsewhere.gpu_work()
 
+    def software_elsewhere(self) -> Program | None:
+        """Return the software of the model's other process; None if it computes in this process."""
+        elsewhere = self._agent_elsewhere()
+        return None if elsewhere is None else elsewhere.software()
+
     def _agent_elsewhere(self) -> ComputesElsewhere | None:
         """Return the agent, if it computes in another process."""
         model = self._loaded

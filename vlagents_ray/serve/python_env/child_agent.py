@@ -14,6 +14,7 @@ from vlagents_ray.abilities import InProcess, Prepares, is_marked
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import NotReset, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.base.program import Program
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -150,6 +151,9 @@ class ChildAgent(Agent, HoldsWeights, ComputesElsewhere):
 
     def gpu_memory(self) -> dict[str, int]:
         return self.child.gpu_memory()
+
+    def software(self) -> Program:
+        return self.child.policy.software
 
     def gpu_work(self) -> GpuWork:
         return self.child.gpu_work()

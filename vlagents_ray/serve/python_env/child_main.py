@@ -28,6 +28,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Agent
+from vlagents_ray.policies.base.program import software
 from vlagents_ray.policies.wrapper import build_agent, require_trainable, unloaded_contract
 from vlagents_ray.protocol.messages import INNER_OPS, MessageLimits
 from vlagents_ray.serve.access.api_keys import NoKey
@@ -135,6 +136,7 @@ def run() -> None:
             "devices": model.devices,
             "variation": model.variation,
             "trained": _describe_trained(agent, engine.weights),
+            "software": software(),
         }
     )
 

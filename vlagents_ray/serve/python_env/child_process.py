@@ -16,6 +16,7 @@ from typing import Any
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable
+from vlagents_ray.policies.base.program import Program
 from vlagents_ray.policies.loading import (
     report_device,
     report_progress,
@@ -48,6 +49,7 @@ class LoadedPolicy:
     contract: Contract | None
     weights: dict[str, Any]  # see `ServedModel.weights`
     trained: dict[str, Any]  # the values that a learner trains, see `child_main`
+    software: Program  # the software of the process
 
     @classmethod
     def from_json(cls, document: dict[str, Any]) -> LoadedPolicy:
@@ -58,6 +60,7 @@ class LoadedPolicy:
             contract=None if contract is None else Contract.from_json(contract),
             weights=document["weights"],
             trained=document["trained"],
+            software=document["software"],
         )
 
 
