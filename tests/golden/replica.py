@@ -56,6 +56,7 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.pauses import PauseDetector
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.loaded_model import PolicySource
 from vlagents_ray.serve.ports import free_port, reserve
@@ -182,6 +183,8 @@ class Server:
             limits = {"rate": settings["rate"]} if "rate" in settings else {}
             keys.add(KEY.removeprefix("vlr_"), **limits)
             self._keys = keys.keys
+        # A request that waits in a pause of a slow process is sent again, with another step.
+        patch.setattr(PauseDetector, "latest", lambda _: 0.0)
         self._shutdown = Shutdown()
         self._websockets = 0  # number of open WebSockets at the HTTP port
         self._gate = Gate()

@@ -125,9 +125,16 @@ class World:
         send(sender, [request], replies.put)
         return lambda: replies.get(timeout=20)[0]
 
+    def advance(self) -> None:
+        """Advance the clock between two batches. The end of a batch is later than its answer, and
+        a batch that seems to take seconds would leave no room for other requests.
+        """
+        wait_for(lambda: not self.engine.queue._running)
+        self.clock.advance()
+
     def ask(self, sender: Sender, op: Any, session: str = ARM, **fields: Any) -> Reply:
         """Send a request of another client than the intruder, and record its answer."""
-        self.clock.advance()
+        self.advance()
         reply = self.begin(sender, Request(op, obs(), session=session, **fields))()
         act = reply.act and (reply.act.action.tolist(), reply.act.info)
         error = reply.error and (type(reply.error).__name__, str(reply.error))
@@ -136,7 +143,7 @@ class World:
 
     def act_with_report(self) -> None:
         """The robot acts, with its slack and its report."""
-        self.clock.advance()
+        self.advance()
         info = {SLACK: 500.0, TICKS: (5, 1), EXECUTED_AGE: 30.0}
         self.begin(self.robot, Request("act", obs(**info), session=ARM))()
 
@@ -397,7 +404,7 @@ def play(
     states: list[Any] = []
     with client_of(world, way) as intruder:
         if refusal == "late episode":
-            world.clock.advance()
+            world.advance()
             intruder.send(Request("reset", obs(), "episode 1", session=ARM))
             intruder.receive()
         before = world.ask(world.robot, "reset", instruction="episode 2").step
@@ -410,7 +417,7 @@ def play(
         if operation.endswith("new session") and refusal != "full":
             world.engine.sessions.limit = 3
 
-        world.clock.advance()
+        world.advance()
         request = request_of(operation, refusal, {"late": before + 1, "future": step + 9})
         if refusal == "late step" and request.op == "close":
             request.step = before - 7
