@@ -220,6 +220,17 @@ def test_a_stopped_robot_does_not_go_to_rest() -> None:
     assert np.allclose(arm.path[-1], 0.004)
 
 
+@pytest.mark.parametrize("name", ["low", "high", "velocity", "acceleration", "jerk"])
+def test_limits_of_different_arms_have_no_stricter_ones(name: str) -> None:
+    bound = -1.0 if name == "low" else 1.0
+    of_two, of_three = (MotionLimits(**{name: (bound,) * size}) for size in (2, 3))
+    for ours, theirs in ((of_two, of_three), (of_three, of_two)):
+        with pytest.raises(ConfigError, match=rf"{name}: expected as many numbers as in the other"):
+            ours.stricter(theirs)
+    of_all = MotionLimits(**{name: 2 * bound})
+    assert getattr(of_two.stricter(of_all), name) == (bound, bound)
+
+
 def test_a_file_of_limits_is_read_with_its_urdf(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(URDF)
     (tmp_path / "arm.yaml").write_text(

@@ -186,6 +186,9 @@ class MotionLimits:
     def stricter(self, other: MotionLimits) -> MotionLimits:
         """Return the stricter of this object and other limits, for each number. The rest pose,
         workspace, unit and distance of the first action are this object's.
+
+        Raises:
+            ConfigError: A value has different numbers of columns in the two limits.
         """
 
         def stricter_of(name: str) -> Numbers | None:
@@ -193,6 +196,12 @@ class MotionLimits:
             ours, theirs = getattr(self, name), getattr(other, name)
             if ours is None or theirs is None:
                 return theirs if ours is None else ours  # type: ignore[no-any-return]
+            if np.size(ours) != np.size(theirs) and 1 not in (np.size(ours), np.size(theirs)):
+                raise ConfigError(
+                    f"{name}: expected as many numbers as in the other limits, {np.size(theirs)}, "
+                    f"got {np.size(ours)}; give both limits for the same arm, or one number for "
+                    "all columns"
+                )
             choose = np.maximum if name == "low" else np.minimum
             return tuple(choose(*np.broadcast_arrays(ours, theirs)).ravel().tolist())
 

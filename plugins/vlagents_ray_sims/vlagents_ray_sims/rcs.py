@@ -364,7 +364,9 @@ class Rcs(SimulatorEnv):
         self._instruction = str(info.get("instruction", ""))
         if not self.instruction:
             raise ConfigError(f"{self._name} has no instruction; set the option `instruction`")
-        return self._observe(raw), {"success": bool(info.get("success", False))}
+        # A task need not report success before its first step; each step must.
+        outcome = {"success": bool(info["success"])} if "success" in info else {}
+        return self._observe(raw), outcome
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
         raw, reward, terminated, _, info = self._env.step(self._arms.command(action))
