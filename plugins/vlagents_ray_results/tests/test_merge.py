@@ -535,15 +535,12 @@ def merged_in_order(folders: Sequence[Path], out: Path, *, accept_changes: bool)
         results = merge(out, folders, accept_changes=accept_changes).results
     except ConfigError:
         return None
-    cases = [
-        (
-            (case.policy_id, case.suite, case.env, case.case_id),
-            (case.planned, case.stopped_at, case.missing),
-            sorted((result.key.seed, result.success_once) for result in case.counted),
-            rate_of([case], "success_once"),
-        )
-        for case in results.cases
-    ]
+    cases = []
+    for case in results.cases:
+        names = (case.policy_id, case.suite, case.env, case.case_id)
+        numbers = (case.planned, case.stopped_at, case.missing)
+        outcomes = sorted((result.key.seed, result.success_once) for result in case.counted)
+        cases.append((names, numbers, outcomes, rate_of([case], "success_once")))
     totals = {name: rate_of(results.of(name), "success_once") for name in results.policy_ids}
     return sorted(cases, key=str), totals
 

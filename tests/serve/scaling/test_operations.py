@@ -67,7 +67,8 @@ class Kind:
     steps: bool  # whether it sends the step of the last answer
 
     def __str__(self) -> str:
-        return f"{'connection' if self.connected else 'HTTP'} {'with' if self.steps else 'without'} steps"
+        transport = "connection" if self.connected else "HTTP"
+        return f"{transport} {'with' if self.steps else 'without'} steps"
 
 
 KINDS = [Kind(connected, steps) for connected in (True, False) for steps in (True, False)]
