@@ -187,7 +187,7 @@ class ReplicaPace:
         self.robots = 0
         self._others = 0  # number of robots that wait behind others
         # Number of waiting requests for which no robot replans earlier, so that the robots behind
-        # others get these places in batches. With 5 % too many robots with 50 rows, 444 of 445 are
+        # others get these places in batches. In the simulation of 445 robots with 50 rows, 444 are
         # in time, and 430 without this.
         self._places = 0
         self._throughput_hz = math.inf  # maximum number of answers per second
