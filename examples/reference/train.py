@@ -93,7 +93,8 @@ class Frames:
     action: torch.Tensor  # (N, D)
     tokens: torch.Tensor  # (N, L)
     # The number of rows from each frame on that the policy had planned before, at the end of which
-    # the expert took over; 0 if the expert drives at the frame, (N,) int64.
+    # the expert took over; -1 if the training may draw any number, since the expert drives at the
+    # frame, (N,) int64.
     given: torch.Tensor
     # The index of the first frame after each frame's episode, or after the expert's part of it,
     # (N,) int64.
@@ -165,7 +166,7 @@ def read(
                     own.append(state_vector(step.obs, parts))
                     around.append(state_vector(step.obs, contract.environment))
                     actions.append(step.expected[0])
-                given += waits
+                given += [wait or -1 for wait in waits]
                 ends += [begun + stop for stop in stops]
                 texts += [episode.instruction] * episode.length
             found, things = np.stack(own), np.stack(around)
@@ -303,8 +304,8 @@ def loss_of(
     if sizes.longest_prefix:
         given = frames.given[index].repeat(DRAWS)
         drawn = torch.randint(0, sizes.longest_prefix + 1, given.shape, generator=draws)
-        lengths = torch.where(given > 0, given, drawn)
-        has_errors = (torch.rand(given.shape, generator=draws) < ERRONEOUS) & (given == 0)
+        lengths = torch.where(given < 0, drawn, given)
+        has_errors = (torch.rand(given.shape, generator=draws) < ERRONEOUS) & (given < 0)
         relative = frames.relative[index].repeat(DRAWS, 1)
         actions = with_errors(actions, lengths * has_errors, relative, draws)
         frozen = (torch.arange(horizon) < lengths[:, None]).float()[..., None]
@@ -355,6 +356,7 @@ def fit(
     if checkpoint.sizes.longest_prefix:
         for name, value in training.network.named_parameters():
             value.requires_grad_(name.partition(".")[0] in HEAD)
+    if checkpoint.sizes.longest_prefix and frames.features is None:
         with torch.no_grad():
             every_frame = np.arange(len(frames.place))
             parts = [
