@@ -2,11 +2,11 @@
 
 Options: `python examples/reference/delays.py --help`.
 
-In each round, the policy drives the tabletop while its answers are late, and in a share of the
-episodes the expert with noise. At each request, copies of the simulated world execute the rows that
-the robot may execute until the answer arrives: the rest of its plan, or such rows with errors. The
-expert continues each copy, and its actions are the labels of the later rows (DAgger, arXiv
-1011.0686). Then the head of the policy is trained on the labels of all rounds.
+In each of two rounds, the policy drives the tabletop while its answers are late, and in a share of
+the episodes the expert with noise. At each request, copies of the simulated world execute the rows
+that the robot may execute until the answer arrives: the rest of its plan, or such rows with errors.
+The expert continues each copy, and its actions are the labels of the later rows (DAgger, arXiv
+1011.0686). Then the head of the policy is trained on all labels.
 """
 
 from __future__ import annotations
@@ -222,18 +222,19 @@ def main(
         int, typer.Option(min=1, help="Largest number of rows with which a chunk begins.")
     ] = 4,
     episodes: Annotated[
-        list[int], typer.Option(min=1, help="Number of episodes of each round.")
-    ] = [2000, 800],  # noqa: B006 - typer copies it
-    steps: Annotated[list[int], typer.Option(min=1, help="Number of steps of each round.")] = [
-        1200,
-        800,
-    ],  # noqa: B006
-    rates: Annotated[list[float], typer.Option(help="Learning rate of each round.")] = [1e-3, 6e-4],  # noqa: B006
+        tuple[int, int], typer.Option(help="Numbers of episodes of the two rounds.")
+    ] = (2000, 800),
+    steps: Annotated[
+        tuple[int, int], typer.Option(help="Numbers of training steps of the two rounds.")
+    ] = (1200, 800),
+    rates: Annotated[
+        tuple[float, float], typer.Option(help="Largest learning rates of the two rounds.")
+    ] = (1e-3, 6e-4),
     seed: Annotated[
         int, typer.Option(help="Seed of the first episode; seeds of the evaluation begin at 0.")
     ] = 6_000_000,
 ) -> None:
-    """Train in rounds, and write the checkpoint."""
+    """Train in two rounds, and write the checkpoint."""
     torch.set_num_threads(1)
     description = train.for_delays(read_checkpoint(start), ["tabletop"], delays)
     trained = {

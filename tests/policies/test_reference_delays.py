@@ -58,7 +58,7 @@ def test_a_small_training_gives_a_policy_that_continues_given_rows(
     monkeypatch.setattr(delays.train, "BATCH", 32)
     out, start = tmp_path / "checkpoint", REFERENCE / "pretrained"
     threads = torch.get_num_threads()
-    delays.main(start, out, LONGEST, [4, 4], [2, 2], [1e-4, 1e-4])
+    delays.main(start, out, LONGEST, (4, 4), (2, 2), (1e-4, 1e-4))
     torch.set_num_threads(threads)
 
     before = delays.train.read_checkpoint(start)

@@ -19,7 +19,9 @@ def test_a_policy_that_amplifies_the_rows_that_it_continues_stays_within_the_lim
     delay: int, is_relative: bool
 ) -> None:
     spec = ActionSpec(dim=DIM, space="ee_position", delta=is_relative, low=-1.0, high=1.0)
-    clock = ClockConfig(latency=delay / HZ, real_time_chunking=True, neutral=[0.0] * DIM)
+    clock = ClockConfig(
+        latency=delay / HZ, mode="async", real_time_chunking=True, neutral=[0.0] * DIM
+    )
     executor = ChunkExecutor(EXECUTE, clock, Contract(action=spec, control_hz=HZ))
     for _ in range(100):
         plan = executor.request_info().get(LEFTOVER)
