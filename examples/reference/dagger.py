@@ -91,7 +91,7 @@ def correct_late(env: EvalEnv, policy: Reference, dataset: Dataset, seed: int, d
     obs, _ = env.reset(seed=seed)
     policy.reset(obs, env.instruction, seed=seed)
     rng, hz = np.random.default_rng(seed), env.contract.control_hz or HZ
-    clock = ClockConfig(latency=delay / hz, mode="async", real_time_chunking=True)
+    clock = ClockConfig(latency=delay / hz, mode="async", real_time_chunking=True, fresh_grip=None)
     episode = dataset.begin(env.instruction, env.contract.action)
     executor, last = ChunkExecutor(EXECUTE, clock, env.contract), None
     ticks, frames, led, solved = 0, 0, False, False
