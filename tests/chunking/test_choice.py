@@ -117,6 +117,13 @@ def test_the_robot_runs_as_the_measured_one_did() -> None:
     assert "10 % of 100" in chosen(contract(), 3, curves=curves, execute=2, horizon=6).line
 
 
+@pytest.mark.parametrize("execute", [0, -1, 1.5, "2", True, [2]])
+def test_no_value_of_a_server_is_a_number_of_rows_that_a_robot_cannot_execute(execute: Any) -> None:
+    choice = chosen(contract(), 3, curves=[curve({0: 98, 3: 95}, execute=execute)])
+    assert choice.settings.execute is None
+    assert "no measured success" in choice.line
+
+
 def test_success_without_careful_rows_is_not_that_of_the_default() -> None:
     curves = [curve({0: 98, 3: 82}, fresh_grip=None), curve({0: 98, 3: 95})]
     assert chosen(contract(), 3, curves=curves).line.endswith("95 % of 100 at 3 rows, tabletop")
