@@ -414,3 +414,51 @@ def test_the_columns_are_part_of_the_contract() -> None:
 
     with pytest.raises(ContractMismatch, match=r"action\.absolute"):
         require_match(contract, Contract(action=ActionSpec(absolute=(5,))))
+
+
+@CASES
+@given(st.data(), KINDS, st.sampled_from(["base", "tool"]), st.booleans())
+def test_what_is_left_of_a_motion_completes_it(
+    data: st.DataObject, kind: str, frame: str, is_scaled: bool
+) -> None:
+    bounds = {"low": -4.0, "high": 4.0} if is_scaled else {}
+    columns = columns_of(pose_spec(kind, delta=True, frame=frame, **bounds))
+    whole, part = data.draw(rotation_rows(kind)), data.draw(rotation_rows(kind))
+    for executed, left in ((part, columns.remaining(whole, part)), (whole, columns.still(whole))):
+        together = columns.joined(executed, left)
+        assert together[:3] == pytest.approx(whole[:3], abs=1e-4)
+        after, expected = rotation_in(kind, together), rotation_in(kind, whole)
+        assert angle_between(after, expected) < 3 * TOLERANCE
+    back = columns.joined(part, columns.reversed(part))
+    assert columns.reach(back[np.newaxis]) == pytest.approx(0.0, abs=1e-4)
+    assert columns.reversed(part)[-1] == part[-1], "a target is no motion"
+
+
+@CASES
+@given(st.data(), KINDS)
+def test_in_the_frame_of_the_tool_motions_are_those_of_rigid_bodies(
+    data: st.DataObject, kind: str
+) -> None:
+    columns = columns_of(pose_spec(kind, delta=True, frame="tool"))
+    first, second = data.draw(rotation_rows(kind)), data.draw(rotation_rows(kind))
+    joined = columns.joined(first, second)
+    turned = rotation_in(kind, first) @ second[:3].astype(np.float64)
+    assert joined[:3] == pytest.approx(first[:3] + turned, abs=1e-4)
+
+
+@CASES
+@given(st.data(), KINDS, st.floats(0.01, 3.0))
+def test_limited_motions_keep_their_direction(
+    data: st.DataObject, kind: str, largest: float
+) -> None:
+    columns = columns_of(pose_spec(kind, delta=True))
+    row = data.draw(rotation_rows(kind))
+    high = np.full(columns.dim, largest, np.float32)
+    limited = columns.limited(row, -high, high)
+    assert limited[:3] == pytest.approx(np.clip(row[:3], -largest, largest))
+    angles = [angle_between(np.eye(3), rotation_in(kind, one)) for one in (row, limited)]
+    assert angles[1] == pytest.approx(min(angles[0], largest), abs=1e-3)
+    between = angle_between(rotation_in(kind, limited), rotation_in(kind, row))
+    assert between == pytest.approx(angles[0] - angles[1], abs=2e-3)
+    assert limited[-1] == row[-1]
+    assert columns.reach(np.stack([row, limited]))[3] == pytest.approx(angles[0], abs=1e-3)

@@ -290,9 +290,12 @@ class Columns:
             part = slice(rotation.start, rotation.stop)
             largest = float(high[rotation.start])
             numbers = row[part].tolist()
-            angle = _angle(rotation.kind, numbers)
+            identity = _IDENTITIES[rotation.kind]
+            turn = _turn(rotation.kind, identity, numbers)
+            angle = math.hypot(*turn)
             if angle > largest:
-                numbers = _fraction(rotation, numbers, largest / angle)
+                shorter = _from_vector([largest / angle * number for number in turn])
+                numbers = _write(rotation.kind, shorter, identity)
             limited[part] = numbers
         return limited
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from delayed_caller import Delayed
 
 from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs, PlayerSettings
 from vlagents_ray.chunking import player as player_module
@@ -72,33 +73,6 @@ class Arm:
         middle = (self.spec.gripper_open + self.spec.gripper_closed) / 2  # type: ignore[operator]
         if float(action[-1]) < middle and self.closed_at is None:
             self.closed_at = self.place
-
-
-class Delayed:
-    """Replaces `AsyncCaller`: an answer arrives after a number of calls of `take`, one per tick."""
-
-    delay = 0
-
-    def __init__(self, agent: Agent) -> None:
-        self._agent, self.idle, self._answer, self._left = agent, True, None, 0
-
-    def ask(self, obs: Obs) -> None:
-        self.idle, self._answer, self._left = False, self._agent.act(obs), self.delay
-
-    def take(self, wait_s: float = 0.0) -> Act | None:
-        if self.idle or wait_s:
-            return None
-        if self._left > 1:
-            self._left -= 1
-            return None
-        self.idle = True
-        return self._answer
-
-    def settle(self) -> None:
-        self.idle = True
-
-    def close(self) -> None:
-        self.idle = True
 
 
 SPECS = {"relative": RELATIVE, "absolute": ABSOLUTE, "two arms": TWO}
