@@ -107,8 +107,11 @@ class FleetSuccess:
 
 
 def curve_of(checkpoint: Path, loop: str = "player") -> SuccessCurve | None:
-    """Return the measured success of a checkpoint with a control loop and its default settings, in
-    the hardest environment; None if it was not measured (`benchmarks.delays`).
+    """Return the measured success of a checkpoint with a control loop; None if it was not measured
+    (`benchmarks.delays`).
+
+    Of several settings, it is the success with those that tolerate the longest delay, each in its
+    hardest environment, as in `vlagents_ray.serve.in_time.tolerated_age_ms`.
 
     Args:
         checkpoint: The folder of the checkpoint.
@@ -117,7 +120,18 @@ def curve_of(checkpoint: Path, loop: str = "player") -> SuccessCurve | None:
     Raises:
         ConfigError: The checkpoint's file of curves cannot be read.
     """
-    mode = {"player": "async", "waiting": "open_loop"}[loop]
-    curves = [curve for curve in read_curves(checkpoint) if curve.mode == mode]
-    by_default = [curve for curve in curves if curve.settings.keys() <= {"execute"}]
-    return min(by_default, key=lambda curve: curve.tolerated, default=None)
+    curves = read_curves(checkpoint)
+    of_player = [curve for curve in curves if curve.mode == "async"]
+    of_waiting = [curve for curve in curves if curve.mode == "open_loop"]
+    # Answers to a waiting loop have no delay, at which the success of all modes is the same.
+    chosen = of_player if loop == "player" else of_waiting or of_player
+
+    hardest: dict[str, SuccessCurve] = {}  # keys: settings
+    for curve in chosen:
+        settings = repr(sorted(curve.settings.items()))
+        hardest[settings] = min(hardest.get(settings, curve), curve, key=_tolerated)
+    return max(hardest.values(), key=_tolerated, default=None)
+
+
+def _tolerated(curve: SuccessCurve) -> int:
+    return curve.tolerated

@@ -105,18 +105,21 @@ def robot(*delays: float, starved: float = 0, waits: tuple[float, ...] = ()) -> 
     return ServedRobot(10.0, 100 + sum(waits), starved, waits, delays)
 
 
-def test_the_curve_of_a_loop_is_that_of_its_default_settings_in_the_hardest_environment(
+def test_the_curve_of_a_loop_is_that_of_its_best_settings_in_the_hardest_environment(
     tmp_path: Path,
 ) -> None:
     assert curve_of(tmp_path) is None
-    hard = replace(CURVE, env="hard", solved={0: CURVE.solved[0]})
+    hard = replace(CURVE, env="hard", solved={0: CURVE.solved[0], 1: CURVE.solved[1]})
     waiting = replace(CURVE, mode="open_loop")
-    prefixes = replace(CURVE, settings={"execute": 4, "real_time_chunking": True})
-    write_curves(tmp_path, [prefixes, CURVE, hard, waiting])
-    assert curve_of(tmp_path) == hard
-    assert curve_of(tmp_path, "waiting") == waiting
-    write_curves(tmp_path, [prefixes])
+    worse = replace(CURVE, settings={"execute": 8}, solved={0: CURVE.solved[0]})
+    for curves in ([worse, CURVE, hard, waiting], [hard, waiting, CURVE, worse]):
+        write_curves(tmp_path, curves)
+        assert curve_of(tmp_path) == hard
+        assert curve_of(tmp_path, "waiting") == waiting
+    write_curves(tmp_path, [waiting])
     assert curve_of(tmp_path) is None
+    write_curves(tmp_path, [CURVE])
+    assert curve_of(tmp_path, "waiting") == CURVE, "without a delay, all modes are the same"
 
 
 def test_a_chosen_wait_is_in_time_for_as_long_as_the_tolerated_delay() -> None:

@@ -551,7 +551,7 @@ compute one request at a time, and their loops wait for each chunk.
 
 
 LOADS = (0.25, 0.7, 1.05)  # numbers of robots, relative to the capacity (`RobotsPlan.capacity`)
-TOLERATED = (1, 2, 3, 5)  # tolerated delays of policies, in rows
+TOLERATED = (1, 2, 3, 5, 8)  # tolerated delays of policies, in rows
 
 
 def successful(checkpoint: Path) -> dict[str, Any]:
