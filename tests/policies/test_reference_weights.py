@@ -17,7 +17,7 @@ import pytest
 from vlagents_ray.evaluate import EvalConfig, Results, SuiteConfig, evaluate
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.local_agent import LocalPolicy
-from vlagents_ray.success import wilson
+from vlagents_ray.success import read_curves, wilson
 from vlagents_ray_results.verification import verify
 
 torch = pytest.importorskip("torch")
@@ -25,6 +25,7 @@ pytestmark = pytest.mark.torch
 
 ROOT = Path(__file__).parents[2]
 CHECKPOINT = ROOT / "examples/reference/checkpoint"
+LATE = ROOT / "examples/reference/late_answers"
 RATES = json.loads((CHECKPOINT / "rates.json").read_text())
 EPISODES = 20
 AT_ONCE = 10  # a batch of ten takes hardly longer than a batch of one
@@ -34,6 +35,25 @@ TASKS = [env for env, (solved, episodes) in RATES["tabletop"].items() if solved 
 def test_they_are_small_enough_for_a_repository() -> None:
     assert (CHECKPOINT / "model.safetensors").stat().st_size < 20e6
     assert sum(file.stat().st_size for file in CHECKPOINT.iterdir()) < 25e6
+    assert sum(file.stat().st_size for file in LATE.iterdir()) < 20e6
+
+
+def test_the_curves_of_late_answers_are_of_its_weights_and_in_its_card() -> None:
+    curves = read_curves(LATE)
+    card = (LATE / "README.md").read_text(encoding="utf-8")
+    config = {"checkpoint": str(LATE), "embodiment": "tabletop"}
+    policy = LocalPolicy(ServerArgs(policy="reference", config=config), config)
+    policy.initialize()
+    digest = policy.metadata["weights"]["digest"]
+    assert len(curves) == 2
+    for curve in curves:
+        assert curve.weights == digest
+        for solved in curve.solved.values():
+            low, high = wilson(solved.solved, solved.episodes)
+            rate = (
+                f"{100 * solved.solved / solved.episodes:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+            )
+            assert rate in card
 
 
 @pytest.fixture
@@ -45,6 +65,27 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_the_checkpoint_for_late_answers_succeeds_at_three_rows_of_delay(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
+    clock = {"latency": 0.3, "mode": "async", "real_time_chunking": True, "fresh_grip": None}
+    suite = SuiteConfig(
+        envs=["tabletop"],
+        env_options={**options, "ends_on_success": True},
+        episodes=2 * EPISODES,
+        seeds=[10_000],
+        num_envs=AT_ONCE,
+        clock=clock,
+    )
+    policies = [{"name": "reference", "execute": 4}]
+    plan = EvalConfig(policies=policies, suites=[suite], out=tmp_path, video="none", workers=0)
+    config = {"checkpoint": str(LATE), "embodiment": "tabletop"}
+    args = ServerArgs(policy="reference", config=config, batch={"max_size": AT_ONCE})
+    found = evaluate(plan, agent_factory=lambda: LocalPolicy(args, config)).total
+    # 244 of 250 were measured. The bound is four standard deviations lower.
+    assert found.success_once.successes / (2 * EPISODES) >= 0.976 - 0.1
 
 
 @pytest.mark.usefixtures("one_thread")
