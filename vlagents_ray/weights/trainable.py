@@ -99,12 +99,18 @@ def _set_values_of_module(module: Any, values: Mapping[str, Any]) -> None:
     """Replace values of a torch module, as `set_values` does."""
     tensors = dict(module.named_buffers(remove_duplicate=False))
     tensors |= module.named_parameters(remove_duplicate=False)
-    with sys.modules["torch"].no_grad():
+    torch = sys.modules["torch"]
+    with torch.no_grad():
         for name, alias in module.state_dict().items():
             if name not in values:
                 continue
             if name in tensors and not _on_gpu(alias):
-                tensors[name].data = values[name]
+                value = values[name]
+                if value.is_inference():
+                    # A guided chunk needs gradients, which tensors of inference mode do not have.
+                    with torch.inference_mode(False):
+                        value = value.clone()
+                tensors[name].data = value
             else:
                 _overwrite(alias, values[name])
 

@@ -179,6 +179,20 @@ def test_a_guided_flow_retains_nothing() -> None:
 
 
 @pytest.mark.torch
+def test_weights_of_inference_mode_can_be_differentiated_after_a_push() -> None:
+    import torch
+
+    from vlagents_ray.weights.trainable import set_values
+
+    module = torch.nn.Linear(2, 1, bias=False).requires_grad_(False)
+    with torch.inference_mode():
+        set_values(module, {"weight": torch.tensor([[2.0, 3.0]])})
+    values = torch.ones(1, 2, requires_grad=True)
+    [gradient] = torch.autograd.grad(module(values), values)
+    assert gradient.tolist() == [[2.0, 3.0]]
+
+
+@pytest.mark.torch
 def test_a_guided_flow_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 
