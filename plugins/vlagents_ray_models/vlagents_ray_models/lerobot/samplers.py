@@ -246,8 +246,8 @@ class FlowSampler(Sampler):
         model, config = policy.model, self.config
         if policy.name == "smolvla":
             self.passes: FlowPasses = SmolVLAPasses(model, compilation)
-            # Measured with 16 rows on a CPU; with equal instructions, all bits are equal.
-            self.variation = "the bits of a row depend on the instructions of the other rows"
+            # Measured with 16 rows on a CPU, in episodes with several instructions.
+            self.variation = "the bits of a row depend on the other rows"
             self.flow_steps = int(config.num_steps)
         else:
             self.passes = Pi0Passes(model, compilation, takes_state=policy.name == "pi0")
