@@ -224,6 +224,11 @@ class ChunkBuffer:
         # The bounds of all numbers, and those of motions only, (D,).
         self._low = self._high = self._least = self._most = np.zeros(0, np.float32)
         self._reach = np.zeros(0, np.float32)  # the largest motions of the plan, (D,)
+        # If all motions are added, 1 in the columns of motions, (D,). Such ways are computed here
+        # rather than by `Columns`: an ensemble has a way for each of its chunks, at each tick.
+        self._added: np.ndarray | None = None
+        self._relative = np.zeros(0, np.intp)  # the columns of motions
+        self._is_bounded = False  # whether a motion has a bound
 
     def _set_columns(self, dim: int) -> Columns:
         """Set the meaning of the columns of actions with `dim` numbers, and return it."""
@@ -237,6 +242,12 @@ class ChunkBuffer:
         self._low = _strictest(np.maximum, -math.inf, dim, self._spec.low, guard_low)
         self._high = _strictest(np.minimum, math.inf, dim, self._spec.high, guard_high)
         self._reach = np.zeros(dim, np.float32)
+        self._relative = np.array(columns.relative, np.intp)
+        are_added = all(one.is_linear for one in columns.rotations if one.is_relative)
+        self._added = None
+        if are_added:
+            self._added = np.zeros(dim, np.float32)
+            self._added[self._relative] = 1.0
 
         is_bounded = np.zeros(dim, bool)
         is_bounded[list(columns.relative)] = True
@@ -245,6 +256,7 @@ class ChunkBuffer:
             is_bounded[list(rotation.columns)] &= rotation.is_linear
         self._least = np.where(is_bounded, self._low, np.float32(-math.inf))
         self._most = np.where(is_bounded, self._high, np.float32(math.inf))
+        self._is_bounded = bool(np.isfinite([self._least, self._most]).any())
         return columns
 
     def add(self, chunk: Chunk) -> bool:
@@ -273,7 +285,10 @@ class ChunkBuffer:
         if self._is_anchored:
             self._reach = np.maximum(self._reach, columns.reach(chunk.rows))
         is_fresh = origin.executed == self.executed
-        planned = _Planned(chunk, origin.motions, origin.part, origin.executed, is_fresh)
+        way = origin.part
+        if way is not None and self._added is not None:
+            way = way * self._added
+        planned = _Planned(chunk, origin.motions, way, origin.executed, is_fresh)
         self._chunks.append(planned)
         self._step = None
         self._observed = None
@@ -488,11 +503,10 @@ class ChunkBuffer:
         newest_row = rows[-1]
         has_way = False
         if is_anchored:
-            columns = self._set_columns(len(newest_row))
             for number, one in enumerate(planned):
                 self._update(one)
                 if one.way is not None:
-                    rows[number] = columns.joined(one.way, self._possible(rows[number]))
+                    rows[number] = self._joined(one.way, self._possible(rows[number]))
                     has_way = True
 
         action = self._merged(rows)
@@ -538,21 +552,36 @@ class ChunkBuffer:
         """Count the motions since the last update in the way to the path of a chunk."""
         chunk = planned.chunk
         for motion in self._motions[planned.counted - self._forgotten :]:
-            columns = self._set_columns(len(motion.action))
             executed = self._possible(motion.action)
             goal = planned.way  # the pose that the chunk reaches, from the robot before the motion
             if motion.step is not None and chunk.step <= motion.step < chunk.end:
                 row = self._possible(chunk.rows[motion.step - chunk.step])
-                goal = row if goal is None else columns.joined(goal, row)
+                goal = row if goal is None else self._joined(goal, row)
             elif goal is None:
-                goal = columns.still(executed)
+                goal = self._set_columns(len(executed)).still(executed)
 
-            is_there = (goal == executed)[list(columns.relative)].all()
-            planned.way = None if is_there else columns.remaining(goal, executed)
+            is_there = (goal == executed)[self._relative].all()
+            planned.way = None if is_there else self._remaining(goal, executed)
         planned.counted = self._forgotten + len(self._motions)
+
+    def _joined(self, way: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """Return `Columns.joined`."""
+        if self._added is None:
+            return self._set_columns(len(row)).joined(way, row)
+        joined: np.ndarray = row + way
+        return joined
+
+    def _remaining(self, goal: np.ndarray, executed: np.ndarray) -> np.ndarray:
+        """Return `Columns.remaining`, without targets if motions are added."""
+        if self._added is None:
+            return self._set_columns(len(goal)).remaining(goal, executed)
+        remaining: np.ndarray = (goal - executed) * self._added
+        return remaining
 
     def _possible(self, row: np.ndarray) -> np.ndarray:
         """Return the motions of a row that the contract allows, which a robot does not exceed."""
+        if not self._is_bounded:
+            return row
         possible: np.ndarray = np.minimum(np.maximum(row, self._least), self._most)
         return possible
 
