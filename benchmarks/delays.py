@@ -25,6 +25,8 @@ from rich.table import Table
 
 from benchmarks.console import Out, save
 from vlagents_ray.cli.console import errors, out, table
+from vlagents_ray.columns import Columns
+from vlagents_ray.contract import ActionSpec
 from vlagents_ray.envs.base import BatchEnv, make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.episode.episode import Diverged, run_episodes
@@ -88,22 +90,39 @@ class Episode:
 
     solved: bool
     ticks: int  # ticks until it was solved, or all ticks
-    standing: int  # ticks at which no row was executed, starved or waiting for an answer
+    standing: int  # ticks without a motion: without a row, or waiting for an answer
     digest: str  # digest of the executed actions
     jerk: float | None  # m/s³
     oscillation: float | None  # m
 
 
-class ToolPath(EpisodeObserver):
-    """Records the positions of the tool, from the first three values of a part of the state."""
+class Motions(EpisodeObserver):
+    """Records the positions of the tool, and counts the ticks without a motion.
 
-    def __init__(self, part: str | None) -> None:
+    Args:
+        spec: The actions of the environment.
+        part: The part of the state whose first three values are the tool's position.
+    """
+
+    def __init__(self, spec: ActionSpec, part: str | None) -> None:
         self.positions: list[np.ndarray] = []
-        self._part = part
+        self.standing = 0
+        self._spec, self._part = spec, part
+        self._last: np.ndarray | None = None
 
     def add_observation(self, obs: Obs) -> None:
         if self._part is not None:
             self.positions.append(np.array(obs.state[self._part][:3], np.float64))
+
+    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        columns = Columns.from_spec(self._spec, len(action))
+        moving = [column for column in range(len(action)) if column not in columns.grippers]
+        # Whether the first target is a motion is unknown.
+        if self._last is not None or set(moving) <= set(columns.relative):
+            still = columns.still(self._last)
+            # A policy's row is never exactly the row of a robot that stands.
+            self.standing += np.array_equal(action[moving], still[moving])
+        self._last = action
 
 
 def jerk(positions: np.ndarray, hz: float) -> float | None:
@@ -192,7 +211,7 @@ class Measurement:
 
     def _run(self, seeds: Sequence[int], clock: ClockConfig | None) -> Iterator[Episode]:
         """Run one episode for each seed together."""
-        paths = [ToolPath(self._part) for _ in seeds]
+        motions = [Motions(self._env.contract.action, self._part) for _ in seeds]
         outcomes = run_episodes(
             self._env,
             self._policy,
@@ -200,19 +219,19 @@ class Measurement:
             [EpisodeKey(self.name, seed, seed, "") for seed in seeds],
             execute=self.execute,
             clock=clock,
-            observers=paths,
+            observers=motions,
             images="requested",
         )
-        for outcome, path in zip(outcomes, paths, strict=True):
+        for outcome, motion in zip(outcomes, motions, strict=True):
             if not isinstance(outcome, EpisodeResult):
                 raise outcome.error if isinstance(outcome, Diverged) else outcome
             if outcome.error is not None:
                 raise VLAgentsError(outcome.error)
-            positions = np.array(path.positions).reshape(-1, 3)
+            positions = np.array(motion.positions).reshape(-1, 3)
             yield Episode(
                 solved=bool(outcome.success_once),
                 ticks=outcome.first_success or outcome.steps,
-                standing=outcome.starved or 0,
+                standing=motion.standing,
                 digest=str(outcome.actions_sha256),
                 jerk=jerk(positions, self.hz),
                 oscillation=oscillation(positions, self.hz),

@@ -298,6 +298,46 @@ def successful_robots() -> Iterator[str]:
         yield f"| {' | '.join(map(str, cells))} |"
 
 
+def delays() -> Iterator[str]:
+    """Yield the tables of success by delay, from `benchmarks.delays`, one for each environment."""
+    heads = (
+        "mode",
+        "rows",
+        "success, %",
+        "difference",
+        "equal",
+        "ticks",
+        "standing, %",
+        "tasks an hour",
+        "jerk",
+        "oscillation",
+    )
+    found = json.loads((ROOT / "examples/reference/delays.json").read_text())
+    for title, measured in found.items():
+        yield f"**{title}**, {measured['hz']:g} Hz:"
+        yield ""
+        yield f"| {' | '.join(heads)} |"
+        yield "|---" * len(heads) + "|"
+        for row in measured["rows"]:
+            off, low, high = (
+                f"{100 * value:+.1f}" for value in (row["difference"], *row["difference_95"])
+            )
+            cells = (
+                row["mode"],
+                row["delay"],
+                f"{share(row['solved'], row['episodes'], 1)} of {row['episodes']}",
+                f"{off} [{low}, {high}]",
+                "all" if row["equal"] == row["episodes"] else str(row["equal"]),
+                f"{row['ticks']:.1f}",
+                f"{100 * row['standing']:.0f}",
+                f"{row['tasks_per_hour']:.0f}",
+                f"{row['jerk']:.1f}",
+                f"{1e3 * row['oscillation']:.1f}",
+            )
+            yield f"| {' | '.join(cells)} |"
+        yield ""
+
+
 def columns() -> Iterator[str]:
     """Yield the rows of the table of an export's columns."""
     yield from ("| column | type | meaning |", "|---|---|---|")
@@ -330,6 +370,7 @@ PARTS: dict[str, Callable[[], str | Iterable[str]]] = {
     "settings of programs": settings_of_programs,
     "success": ways,
     "successful robots": successful_robots,
+    "delays": delays,
     "columns": columns,
     "extras": packages_of_extras,
 }

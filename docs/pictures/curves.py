@@ -94,4 +94,4 @@ def _points(
 
 if __name__ == "__main__":
     found = json.loads((ROOT / "examples/reference/delays.json").read_text())
-    (Path(__file__).parent / "success.svg").write_text(success_by_delay(found["rows"]))
+    (Path(__file__).parent / "success.svg").write_text(success_by_delay(found["tabletop"]["rows"]))

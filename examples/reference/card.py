@@ -17,6 +17,7 @@ import typer
 from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.results.reader import CaseResults, rate_of
 from vlagents_ray.policies.reference.checkpoint import Checkpoint, read_checkpoint
+from vlagents_ray.success import SuccessCurve, read_curves
 
 _TEXT = """---
 license: apache-2.0
@@ -38,7 +39,7 @@ No demonstration was recorded with these seeds. The brackets contain 95 % interv
 instruction names other colours or another task, so that a policy that reads it must fail.
 
 {rates}
-
+{late}
 `vlagents-ray verify NAME.bundle.zip` reproduces these results.
 
 ## Training
@@ -81,6 +82,33 @@ def rates(results: Sequence[Results]) -> list[str]:
     return lines
 
 
+def late(curves: Sequence[SuccessCurve]) -> str:
+    """Return the part about late answers; empty without curves."""
+    if not curves:
+        return ""
+    lines = [
+        "",
+        "## Late answers",
+        "",
+        (
+            "Episodes solved, %, by the delay of the answers in rows, which are ticks of the "
+            "environment. The *tolerated delay* is the longest one up to which the lower 95 % "
+            "bound is at least 0.95 of the success without delay."
+        ),
+        "",
+        "| environment | mode | solved by delay | tolerated delay |",
+        "|---|---|---|---|",
+    ]
+    for curve in curves:
+        shares = [
+            f"{rows}: {100 * one.solved / one.episodes:.1f}" for rows, one in curve.solved.items()
+        ]
+        settings = ", ".join(f"{name} {value}" for name, value in curve.settings.items())
+        mode = f"`{curve.mode}`, {settings}"
+        lines.append(f"| {curve.env} | {mode} | {'; '.join(shares)} | {curve.tolerated} |")
+    return "\n".join([*lines, ""])
+
+
 def trainings(trained: Mapping[str, Any], checkpoint: Checkpoint) -> list[str]:
     """Return a text for each training, the first one first.
 
@@ -121,6 +149,7 @@ def main(checkpoint: Path, evaluations: list[Path]) -> None:
     text = _TEXT.format(
         **trained,
         rates="\n".join(rates(results)),
+        late=late(read_curves(checkpoint)),
         trainings="\n\n".join(trainings(trained, stated)),
         millions=trained["parameters"] / 1e6,
         known=len(stated.words),

@@ -13,6 +13,7 @@ import typer
 from benchmarks import delays
 from benchmarks.absolute import AbsoluteTabletop, FromFirstPose
 from benchmarks.delays import Episode, curves, jerk, oscillation, row
+from vlagents_ray.contract import ActionSpec
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.success import SuccessCurve, read_curves
@@ -51,6 +52,27 @@ def test_a_path_without_jerk_and_one_that_oscillates() -> None:
     window = 2 * round(0.5 * HZ / 2) + 1
     assert oscillation(shaken, HZ) == pytest.approx(0.01 * (1 - 1 / window), rel=1e-6)
     assert oscillation(straight[: window - 1], HZ) is None
+
+
+@pytest.mark.parametrize(
+    ("delta", "actions", "standing"),
+    [
+        (
+            True,
+            [[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.0, -1.0]],
+            2,
+        ),  # the gripper does not count
+        (False, [[0.2, 0.1, 1.0], [0.2, 0.1, -1.0], [0.2, 0.2, -1.0], [0.2, 0.2, -1.0]], 2),
+    ],
+)
+def test_a_robot_that_only_moves_its_gripper_stands(
+    delta: bool, actions: list[list[float]], standing: int
+) -> None:
+    spec = ActionSpec(dim=3, delta=delta, gripper_open=1.0, gripper_closed=-1.0)
+    motions = delays.Motions(spec, None)
+    for action in actions:
+        motions.add_action(np.array(action, np.float32), 0.0, False)
+    assert motions.standing == standing
 
 
 def test_a_row_compares_the_same_seeds() -> None:
