@@ -1,6 +1,8 @@
-"""Draw the success of the reference policy over the delay of its answers, a line for each mode:
-`python docs/pictures/curves.py` writes the picture from `examples/reference/delays.json`. It has a
-background, so that one file is readable on light and on dark pages.
+"""Draw the success of the reference policy over the delay of its answers.
+
+`python docs/pictures/curves.py` writes the picture, a line for each way to execute late answers, from
+`examples/reference/delays.json`. It has a background, so that one file is readable on light and on
+dark pages.
 """
 
 from __future__ import annotations
@@ -13,17 +15,21 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 _WIDTH, _HEIGHT, _LEFT, _TOP, _RIGHT, _BOTTOM = 900, 430, 78, 56, 240, 60
-_MODES = {
-    "async": "#00695c",
-    "async, grips at once": "#3949ab",
-    "stop and wait": "#546e7a",
-    "prefixes": "#a0430a",
-}
+_BEFORE = "tabletop, late rows as they are (commit 2c1bb1c2)"
+# For each line: its name, the table and the mode in the file, and its colour.
+_LINES = (
+    ("without noise", "tabletop, with `initial_noise: 0`", "async, grips at once", "#6a1b9a"),
+    ("async (default)", "tabletop", "async", "#00695c"),
+    ("async, grips at once", "tabletop", "async, grips at once", "#3949ab"),
+    ("stop and wait", "tabletop", "stop and wait", "#546e7a"),
+    ("async before", _BEFORE, "async", "#a0430a"),
+)
 _LEAST = 40  # %, the lower end of the vertical axis
 
 
-def success_by_delay(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the picture of the rows of `benchmarks.delays`, as SVG."""
+def success_by_delay(tables: Mapping[str, Any]) -> str:
+    """Return the picture of the tables of `benchmarks.delays`, as SVG."""
+    rows = tables["tabletop"]["rows"]
     delays = sorted({int(row["delay"]) for row in rows if row["delay"].isdigit()})
     longest = delays[-1]
 
@@ -57,10 +63,8 @@ def success_by_delay(rows: Sequence[Mapping[str, Any]]) -> str:
 
     below = 0.0  # the lowest place that a label of an earlier line has
     ends = []
-    for mode, colour in _MODES.items():
-        points = list(_points(rows, mode))
-        if not points:
-            continue
+    for name, table, mode, colour in _LINES:
+        points = list(_points(tables[table]["rows"], mode))
         path = "L".join(f"{x(delay):.1f} {y(rate):.1f}" for delay, rate, _, _ in points)
         parts.append(f'<path d="M{path}" fill="none" stroke="{colour}" stroke-width="3"/>')
         for delay, rate, low, high in points:
@@ -71,12 +75,12 @@ def success_by_delay(rows: Sequence[Mapping[str, Any]]) -> str:
                 ),
                 f'<circle cx="{x(delay):.1f}" cy="{y(rate):.1f}" r="4.5" fill="{colour}"/>',
             ]
-        ends.append((y(points[-1][1]), x(points[-1][0]), mode, colour))
-    for end, right, mode, colour in sorted(ends):
+        ends.append((y(points[-1][1]), x(points[-1][0]), name, colour))
+    for end, right, name, colour in sorted(ends):
         below = max(end + 5, below + 20)
         parts.append(
             f'<text x="{right + 14:.1f}" y="{below:.1f}" fill="{colour}" font-weight="600">'
-            f"{escape(mode)}</text>"
+            f"{escape(name)}</text>"
         )
     return "\n".join([*parts, "</g></svg>"]) + "\n"
 
@@ -94,4 +98,4 @@ def _points(
 
 if __name__ == "__main__":
     found = json.loads((ROOT / "examples/reference/delays.json").read_text())
-    (Path(__file__).parent / "success.svg").write_text(success_by_delay(found["tabletop"]["rows"]))
+    (Path(__file__).parent / "success.svg").write_text(success_by_delay(found))
