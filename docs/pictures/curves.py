@@ -1,8 +1,8 @@
 """Draw the success of the reference policy over the delay of its answers.
 
-`python docs/pictures/curves.py` writes the picture, a line for each way to execute late answers, from
-`examples/reference/delays.json`. It has a background, so that one file is readable on light and on
-dark pages.
+`python docs/pictures/curves.py` reads `examples/reference/delays.json`, and draws a line for each
+way to execute late answers. The picture has a background, so that one file is readable on light
+and on dark pages.
 """
 
 from __future__ import annotations
