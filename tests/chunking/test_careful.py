@@ -241,6 +241,9 @@ def test_a_policy_is_told_how_many_rows_are_executed_before_the_robot_waits() ->
     plan.add(Chunk(1, 0, closing))
     careful = CarefulRows(plan, 2)
     assert [careful.rows_ahead(OPEN, delay) for delay in (1, 2, 3, 7)] == [1, 2, 3, 3]
+    # With answers that are exactly as late as the age, the robot waits.
+    assert CarefulRows(plan, 4).rows_ahead(OPEN, 4) == 3
+    assert CarefulRows(plan, 5).rows_ahead(OPEN, 4) == 4
 
 
 def test_without_both_values_of_a_gripper_a_robot_does_not_wait_and_says_so(
