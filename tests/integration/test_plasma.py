@@ -9,7 +9,6 @@ import gc
 import os
 import random
 import re
-import select
 import signal
 import subprocess
 import sys
@@ -287,7 +286,7 @@ def test_faults_are_answered_and_harm_nobody(
         (free, "lease"),
     ):
         connection.send(message)
-        shm.wait(connection, select.POLLIN, time.monotonic() + 60)
+        shm.wait(transport._poller, time.monotonic() + 60)
         [reply] = transport._receive(connection)
         error = reply.error
         assert isinstance(error, MalformedMessage)

@@ -237,7 +237,7 @@ class ClockConfig(_PlanModel):
         description="Send the policy the remaining rows of the last chunk, and the number of "
         "ticks of the delay. Requires `mode: async`.",
     )
-    fresh_grip: Annotated[int, Field(ge=1)] | None = Field(
+    fresh_grip: Rows | None = Field(
         default=FRESH_GRIP,
         description="Age in rows from which the observation of a row is too old to open or close a "
         "gripper: the robot stands and waits for a new answer. It has an effect if answers are as "

@@ -28,17 +28,17 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.protocol import messages
-from vlagents_ray.protocol.frames import decode_requests, encode_replies
+from vlagents_ray.protocol.frames import encode_replies
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.serve.access.api_keys import current_caller
 from vlagents_ray.serve.access.charges import current_charge
-from vlagents_ray.serve.endpoints import answers, http_messages
+from vlagents_ray.serve.endpoints import http_messages
 from vlagents_ray.serve.endpoints.asgi_websocket import SCOPE_KEY as WEBSOCKET
 from vlagents_ray.serve.endpoints.asgi_websocket import AsgiWebSocket
 from vlagents_ray.serve.endpoints.charged_messages import ChargedMessage, ChargedMessages
 from vlagents_ray.serve.endpoints.client_socket import current_client
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
-from vlagents_ray.serve.endpoints.request_stream import RequestStream
+from vlagents_ray.serve.endpoints.request_stream import RequestStream, StreamForms
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender, message_admission
 from vlagents_ray.serve.requests import IncomingMessage
@@ -215,18 +215,19 @@ class _HttpEndpoint:
         sender = Sender(
             self.engine, "websocket", caller=caller, has_left=current_client(), can_move=True
         )
+        forms = StreamForms(self.limits)
         await socket.accept()
         try:
             async with ChargedMessages(socket, caller) as arriving:
                 async for message in arriving:
-                    await socket.send_bytes(await self._answer(sender, message))
+                    await socket.send_bytes(await self._answer(sender, forms, message))
         except WebSocketDisconnect:
             return
         finally:
             sender.release()
 
-    async def _answer(self, sender: Sender, message: ChargedMessage) -> bytes:
-        """Return the answer to a message of a forwarded WebSocket, a frame or a probe."""
+    async def _answer(self, sender: Sender, forms: StreamForms, message: ChargedMessage) -> bytes:
+        """Return the answer to a message of a forwarded WebSocket, or to a probe."""
         frame, charge = message
         incoming = sender.message(charge)
         admission = message_admission(self.engine, charge, self.limits, message.size)
@@ -241,14 +242,14 @@ class _HttpEndpoint:
             admission.begin_message()
             if frame is None:
                 raise MalformedMessage("stream: expected a binary message, got a text")
-            decoded = await admission.decoded(partial(decode_requests, frame))
+            decoded = await admission.decoded(partial(forms.decode, frame))
             incoming.decoded(decoded)
             await sender.ask(incoming, decoded, admission)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             request_id = "" if isinstance(error, VLAgentsError) else uuid.uuid4().hex
             problem = http_messages.public_problem(error, "stream", request_id)
             incoming.refuse(problem, request_id)
-        data = answers.as_frame(incoming)
+        data = forms.encode(incoming)
         self.engine.stats.record(incoming)
         return data
 

@@ -23,6 +23,31 @@ from vlagents_ray.serve.engine.sender import Sender, message_admission
 from vlagents_ray.serve.requests import IncomingMessage
 
 
+class StreamForms:
+    """The forms of messages on one WebSocket: frames, and compact acts (`protocol.compact`)."""
+
+    def __init__(self, limits: messages.MessageLimits) -> None:
+        self._reader = CompactReader(limits)
+        self._answers_compact = False  # whether the client reads answers in compact form
+
+    def decode(self, message: bytes, budget: messages.Budget) -> Decoded:
+        """Return the requests of a message.
+
+        Raises:
+            InvalidInput: The message is malformed.
+            TooManyRequests: The sender's key is over its rate.
+        """
+        if is_compact(message):
+            self._answers_compact = True
+            return self._reader.read_stream(message, budget)
+        return decode_requests(message, budget)
+
+    def encode(self, message: IncomingMessage) -> bytes:
+        """Return the answers of a message, in compact form if the client sends and reads it."""
+        compact = answers.as_compact(message) if self._answers_compact else None
+        return answers.as_frame(message) if compact is None else STREAM_TAG + compact
+
+
 class RequestStream(MessageHandler):
     """Decodes the frames of a WebSocket, submits their requests, and sends the answers."""
 
@@ -38,8 +63,7 @@ class RequestStream(MessageHandler):
         self._connection = connection
         self._engine = engine
         self._limits = limits
-        self._reader = CompactReader(limits)
-        self._answers_compact = False  # whether the client reads answers in compact form
+        self._forms = StreamForms(limits)
         self._sender = Sender(
             engine, "websocket", caller=caller, has_left=connection.has_left, can_move=True
         )
@@ -61,12 +85,8 @@ class RequestStream(MessageHandler):
                 self._connection.send(messages.probe_answer(len(message)))
                 return
 
-            decode = partial(decode_requests, message)
-            if is_compact(message):
-                self._answers_compact = True
-                decode = partial(self._reader.read_stream, message)
             self._connection.decode(
-                decode,
+                partial(self._forms.decode, message),
                 admission,
                 partial(self._submit, incoming, admission, len(message), arrived),
                 partial(self._refuse, incoming),
@@ -120,7 +140,4 @@ class RequestStream(MessageHandler):
         self.deliver(incoming)
 
     def _send(self, message: IncomingMessage) -> None:
-        compact = answers.as_compact(message) if self._answers_compact else None
-        self._connection.send(
-            answers.as_frame(message) if compact is None else STREAM_TAG + compact
-        )
+        self._connection.send(self._forms.encode(message))
