@@ -114,10 +114,11 @@ class EaseIn:
         if self._tick <= 0:  # the approach
             share = 1.0 + self._tick / self._approach
             share *= share * share * (10.0 - 15.0 * share + 6.0 * share * share)
-            command = self._part(action, share, share)
+            goal = self._begin_of(action, after)
+            command = self._part(goal, share, share)
             if self._tick < 0:
                 return command, 0
-            self._from = action
+            self._from = goal
             return command, 0 if self._is_motion else 1
 
         if not self._ticks and not self.catches_up:
@@ -139,6 +140,30 @@ class EaseIn:
             self._ticks = self._ticks if after is not None else 0
             return command, 1
         return self._columns.joined(command, self._part(after, 0.0, share)), 1
+
+    def _begin_of(self, action: np.ndarray, after: np.ndarray | None) -> np.ndarray:
+        """Return the pose at which the ramp begins, (D,).
+
+        In a plan of motions, the ramp leads to the first row. Its targets begin before their values
+        in this row by the step of the next row, as far as the start is as far. Otherwise, they
+        would stand while the first motion is executed, and then begin at its speed.
+
+        Args:
+            action: The first row of the plan, (D,).
+            after: The row after it, (D,); None if there is none.
+        """
+        if not self._is_motion or after is None:
+            return action
+        begin = action.copy()
+        others = set(self._at_once)
+        for rotation in self._columns.rotations:
+            others.update(rotation.columns)
+        targets = [column for column in self._columns.absolute if column not in others]
+        way = action[targets] - self._from[targets]
+        step = after[targets] - action[targets]
+        ahead = np.where(way * step > 0.0, np.minimum(np.abs(way), np.abs(step)), 0.0)
+        begin[targets] -= np.sign(way) * ahead
+        return begin
 
     def _begin_section(self, known: int) -> None:
         """Begin a section of the ramp, which ends at full speed; if too few rows are known for it,

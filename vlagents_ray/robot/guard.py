@@ -307,7 +307,7 @@ class Guard:
             row: The row without the correction, (D,), at which the search begins.
             brakes: Whether the search begins at a stop if the guard rejects the row, since the last
                 command was corrected. A row that is beyond the bounds, or too fast, remains
-                rejected.
+                rejected, and so does a row whose targets are.
 
         Returns:
             The action, (D,) float32; None if there is none.
@@ -338,13 +338,16 @@ class Guard:
         is_within = all(low[i] <= number <= high[i] for i, number in enumerate(row.tolist()))
         if not brakes or is_fast or not is_within:
             return None
-        start = last.copy()
-        at_once = self._at_once(columns)
-        start[at_once] = goal[at_once]
 
+        # Targets have no correction. If they lagged behind, the next rows would be rejected too.
         def braked(share: float) -> np.ndarray:
-            return columns.travel(start, goal, 0.0, share)
+            action = columns.travel(last, goal, 0.0, share)
+            targets = list(columns.absolute)
+            action[targets] = row[targets]
+            return action
 
+        if not is_allowed(braked(0.0)):
+            return None
         return braked(_largest(lambda share: is_allowed(braked(share))))
 
     def _may_follow(

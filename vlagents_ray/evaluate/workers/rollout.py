@@ -179,7 +179,7 @@ class Rollout:
             new_fields["env"] = EnvInfo(
                 plain_values(self._env.describe()),
                 self._env.contract.to_json(),
-                code_of(env_class(case.env).__module__),
+                code_of(f"{env_class(case.env).__module__}:"),
                 env_program(case, loaded_code),
                 socket.gethostname(),
             )
