@@ -304,7 +304,8 @@ def test_observations_that_wait_are_counted_and_need_no_threads(port: Port, numb
             control.start()
         wait_for(lambda: sum(item.kind == "control" for item in session._inbox) == 4)
         time.sleep(0.2)
-        assert python_threads() - threads <= len(controls)
+        # A thread of an earlier test may still end.
+        wait_for(lambda: python_threads() - threads <= len(controls))
         assert port.admission.held - held >= len(data) * 6
         assert port.admission.held <= IN_FLIGHT
         assert rss() - before <= port.admission.held - held + SLACK
