@@ -28,6 +28,8 @@ from vlagents_ray_models.pi0 import LoadedPi0, Pi0, Pi0HfPasses, _scale
 # ATen calls that are no views of one act, 10 steps: 13,138 with transformers 5.23, of which each
 # costs microseconds.
 MOST_CALLS = 13_900
+# An act with a plan also differentiates each step: 26,038.
+MOST_GUIDED_CALLS = 27_500
 
 
 def row(policy: Pi0, i: int, obs: Obs) -> Row:
@@ -156,19 +158,19 @@ def published() -> Pi0:
 
 
 @pytest.mark.parametrize(
-    ("info", "waits"),
+    ("info", "waits", "most"),
     [
-        ({}, 1),
-        ({SAMPLES: 2}, 1),
-        ({WANT: ["logprob", "replay"]}, 2),
-        ({LEFTOVER: np.ones((6, 7)), DELAY: 2}, 1),
+        ({}, 1, MOST_CALLS),
+        ({SAMPLES: 2}, 1, MOST_CALLS),
+        ({WANT: ["logprob", "replay"]}, 2, MOST_CALLS),
+        ({LEFTOVER: np.ones((6, 7)), DELAY: 2}, 1, MOST_GUIDED_CALLS),
     ],
     ids=["an act", "samples", "log-probabilities", "a plan"],
 )
 def test_an_act_waits_only_for_its_results(
-    published: Pi0, info: dict[str, Any], waits: int
+    published: Pi0, info: dict[str, Any], waits: int, most: int
 ) -> None:
     sessions = [begun(published, i) for i in range(4)]
     counted = calls_of_an_act(published, sessions, [seen(i, **info) for i in range(4)])
     assert sum(counted.waits.values()) == waits, counted.waits
-    assert counted.calls <= MOST_CALLS
+    assert counted.calls <= most
