@@ -1117,9 +1117,10 @@ class Usage:
         """Return the usage of a process."""
         waits = 0
         for task in Path(f"/proc/{pid}/task").iterdir():
-            for line in (task / "status").read_text().splitlines():
-                if line.startswith("voluntary_ctxt_switches"):
-                    waits += int(line.split()[1])
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread has ended
+                for line in (task / "status").read_text().splitlines():
+                    if line.startswith("voluntary_ctxt_switches"):
+                        waits += int(line.split()[1])
         return cls(time.monotonic(), cpu_seconds(pid), waits)
 
 
