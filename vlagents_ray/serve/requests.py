@@ -302,7 +302,9 @@ class IncomingMessage:
     def decoded(self, decoded: Decoded) -> None:
         """Record that the requests are decoded, with their operations and priorities."""
         self.decoded_at = time.perf_counter()
-        self.kinds = [(request.op, request.priority) for request in decoded.requests]
+        self.kinds = []
+        for request in decoded.requests:  # a comprehension is a function call in Python 3.11
+            self.kinds.append((request.op, request.priority))
         for index in sorted(decoded.refused):
             self.kinds.insert(index, ("unknown", "robot"))
 

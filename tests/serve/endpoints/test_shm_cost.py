@@ -31,7 +31,7 @@ ACTS = 50
 MOST_CALLS = 82
 OBS = Obs({"front": np.zeros((64, 64, 3), np.uint8)}, 0.5, {"joints": np.zeros(7, np.float32)})
 # Functions whose number of calls depends on the elapsed time.
-POLLING = ("_wait_for_request", "_wait_for_event", "receives", "poll", "mark_idle", "mark_busy")
+POLLING = ("_wait_for_request", "_wait_for_event", "poll", "mark_idle", "mark_busy")
 
 
 class Counted(Agent):
